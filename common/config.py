@@ -1,0 +1,454 @@
+"""The one configuration: a frozen section for each part, every field with its source.
+
+Precedence: a flag beats an environment variable beats the file beats the default written here.
+The defaults are the paper's where it speaks ("paper"), the game it descends from where that
+settles it ("ancestor"), ours otherwise ("ours"). An unknown name is refused with the nearest
+right one.
+"""
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, cast
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from common.errors import ConfigError
+
+ENV_PREFIX = "MRCDRL_"
+EXTENDS = "extends"
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Section(BaseModel):
+    """A part of the configuration: frozen, and strict about names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class ArenaConfig(Section):
+    """The 2-D world, its rewards and its pictures (paper sections 3 and 4)."""
+
+    kind: Literal["robots", "counting"] = "robots"
+    """`robots`: the paper's arena. `counting`: pictures that encode actor, episode and step, for
+    tests of the data path. (ours)"""
+    num_robots: Annotated[int, Field(ge=1, le=10)] = 2
+    """Robots, and as many targets. (paper: 2, 3, 4)"""
+    size_px: Annotated[int, Field(ge=120)] = 600
+    """Width and height of the square arena. (paper)"""
+    wall_offset_px: Annotated[float, Field(ge=0)] = 10
+    """From the border to the wall's outer face. (paper)"""
+    wall_thickness_px: Positive = 2
+    """(paper)"""
+    robot_radius_px: Positive = 25
+    """c_r. (paper)"""
+    target_size_px: Positive = 30
+    """s_w = s_h, sides of a square target. (paper)"""
+    turn_deg: Annotated[float, Field(gt=0, lt=180)] = 23
+    """Turn of a `left` or `right` action. (paper)"""
+    step_px: Positive = 2.5
+    """Way moved after the turn, by every action. (paper; ancestor: a turn moves on too)"""
+    target_layout: Literal["fixed", "random"] = "fixed"
+    """`fixed`: one layout for each number of robots; `random`: anew each episode. (ours: the
+    paper calls only the robots' start random)"""
+    targets_px: tuple[tuple[float, float], ...] = ()
+    """Target centres (x, y) instead of the built-in fixed layout; one a robot. (ours)"""
+    success_radius_px: Positive = 20
+    """delta: every robot this near to a target of its own is success. (paper)"""
+    max_collisions: Count = 5
+    """Robot collisions that end a training episode as failed; the test ends at 1. (paper)"""
+    back_off_frames: Annotated[int, Field(ge=0)] = 0
+    """Frames a robot is driven backwards after a collision; 0: its move is undone and it goes on.
+    (ancestor: 10)"""
+    success_reward: float = 200
+    """To each robot. (paper)"""
+    collision_reward: float = -5
+    """(paper)"""
+    step_reward: float = 0.03
+    """Off target, no collision. (paper)"""
+    proximity_weight: Fraction = 0.7
+    """p in r = r_chi p + r_f (1 - p). (paper, Fig. 5)"""
+    f_max: Count = 500
+    """Frames after which r_f is 0. (ours: the paper names f_max, not its value)"""
+    max_frames: Count = 1000
+    """Frames after which an episode is truncated (and bootstrapped). (ours)"""
+    view_px: Annotated[int, Field(ge=12, le=255)] = 60
+    """Width and height of a robot's picture. (paper)"""
+    crop_px: Positive = 600
+    """w = h of the rectangle cut out around the robot. (ours: not given; 600 shows the half
+    around it)"""
+    orientation: Literal["unrotated", "heading_up"] = "unrotated"
+    """Of the cut-out. (paper names no rotation; heading_up is ours)"""
+    stack: Annotated[int, Field(ge=1, le=16)] = 4
+    """Consecutive pictures that make a state. (paper)"""
+    renderer: Literal["analytic", "literal"] = "analytic"
+    """`literal` draws 600x600, greys, crops, pads and area-resizes as the paper does; `analytic`
+    computes the same coverage straight at 60x60. (ours)"""
+    codec: Literal["scene", "frames"] = "scene"
+    """What an observation record holds: poses from which the picture is drawn, or pixels. (ours)"""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        inner = self.size_px - 2 * (self.wall_offset_px + self.wall_thickness_px)
+        if inner < 2 * self.robot_radius_px:
+            raise ValueError(
+                f"no robot of radius {self.robot_radius_px} px fits inside walls {inner} px apart"
+            )
+        if self.targets_px and len(self.targets_px) != self.num_robots:
+            raise ValueError(
+                f"targets_px has {len(self.targets_px)} targets for {self.num_robots} robots; "
+                "give one a robot"
+            )
+        if self.codec == "scene" and self.kind == "counting":
+            raise ValueError('kind = "counting" encodes its counters in pixels: codec = "frames"')
+        return self
+
+
+class AgentConfig(Section):
+    """What is learned (paper sections 4 and 5.2)."""
+
+    kind: Literal["duel", "ddqn", "dqn"] = "duel"
+    """`dqn`: target (4). `ddqn`: target (2). `duel`: target (2) and two streams (1). (paper)"""
+    gamma: Annotated[float, Field(gt=0, lt=1)] = 0.99
+    """(paper)"""
+    n_step: Annotated[int, Field(ge=1, le=32)] = 1
+    """Rewards summed before the bootstrap. (paper: 1; Ape-X: 3)"""
+    reward_scale: Positive = 1.0
+    """Rewards are multiplied by this in the learner's target. (ours)"""
+    loss: Literal["squared", "huber"] = "squared"
+    """Of the TD error, Eq. (3). (paper: squared)"""
+    optimizer: Literal["adam", "rmsprop"] = "adam"
+    """(ours; ancestor: rmsprop)"""
+    learning_rate: Positive = 1e-4
+    """(ours)"""
+    optimizer_epsilon: Positive = 1e-7
+    """Added to the root of the second moment; 1.5e-4 all but stops learning here. (ours)"""
+    max_gradient_norm: Annotated[float, Field(ge=0)] = 10.0
+    """Clipped above; 0: never. (ours; dueling paper: 10)"""
+    target_period: Count = 2500
+    """Learner steps between copies to the target network: t of section 4. (ours; Ape-X: 2500)"""
+
+
+class ExplorationConfig(Section):
+    """How epsilon of the epsilon-greedy actors runs (paper section 5.2)."""
+
+    kind: Literal["schedule", "ladder"] = "schedule"
+    """`schedule`: epsilon over learner steps, the same in every actor. `ladder`: the schedule,
+    raised to a power 1 ... ladder_power spread over the arenas of all actors. (ours; Ape-X)"""
+    schedule: tuple[tuple[int, float], ...] = ((0, 1.0), (800_000, 0.1))
+    """Points (learner step, epsilon), linear between, constant after the last. (paper)"""
+    ladder_power: Annotated[float, Field(ge=1)] = 3.0
+    """Power of the least exploring arena. (ours; Ape-X: 8 with 360 actors)"""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        steps = [step for step, _ in self.schedule]
+        if not steps or steps[0] != 0 or steps != sorted(set(steps)):
+            raise ValueError("schedule needs points whose steps rise from 0")
+        if any(not 0 <= epsilon <= 1 for _, epsilon in self.schedule):
+            raise ValueError("schedule has an epsilon outside 0 ... 1")
+        return self
+
+
+class ReplayConfig(Section):
+    """The table and its rate limiter (paper section 5.2)."""
+
+    capacity: Count = 400_000
+    """Transitions; the oldest are replaced. (paper)"""
+    min_size: Count = 50_000
+    """Transitions before the first sample is given. (paper)"""
+    samples_per_insert: Annotated[float, Field(ge=0)] = 8.0
+    """Transitions sampled for each inserted; both sides are held to it; 0: no limit. (ours)"""
+    tolerance: Annotated[float, Field(ge=0)] = 0.1
+    """Share of min_size x samples_per_insert by which either side may run ahead. (ours)"""
+    hold_s: Positive = 5.0
+    """A request the limiter holds is answered "held" after this; the client asks again. (ours)"""
+    seed: int = 0
+    """Of the sampler. (ours)"""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.min_size > self.capacity:
+            raise ValueError(
+                f"min_size {self.min_size} exceeds capacity {self.capacity}: "
+                "sampling would never start"
+            )
+        return self
+
+
+class ActorConfig(Section):
+    """Collecting."""
+
+    num_arenas: Count = 8
+    """Arenas stepped together, one batched inference for all their robots. (ours)"""
+    chunk_length: Annotated[int, Field(ge=1, le=1024)] = 50
+    """Transitions a chunk. (Ape-X)"""
+    spool_chunks: Count = 64
+    """Chunks waiting to be acknowledged before the arenas stop: nothing is dropped. (ours)"""
+    insert_timeout_s: Positive = 60.0
+    """Without an acknowledgement for so long, the actor says whom it waits for. (ours)"""
+    threads: Count = 1
+    """Torch threads. (ours)"""
+
+
+class LearnerConfig(Section):
+    """Learning."""
+
+    batch_size: Count = 32
+    """(paper)"""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of convolutions and hidden layers; heads and loss are float32 always. `auto`: bfloat16
+    where the processor computes in it. (ours)"""
+    device: str = "auto"
+    """`auto`: cuda if there is one, else cpu. (ours)"""
+    threads: Annotated[int, Field(ge=0)] = 0
+    """Torch threads; 0: the cores less one, at least 1. (ours)"""
+    prefetch_batches: Count = 8
+    """Batches decoded ahead of the step. (ours)"""
+    requests_in_flight: Count = 4
+    """Sample requests sent ahead. (ours)"""
+    symmetries: bool = False
+    """Turn and mirror each sampled transition by a random symmetry of the target layout, its
+    action with it. (ours)"""
+    publish_period: Count = 100
+    """Learner steps between publications of the weights. (ours)"""
+    checkpoint_period_s: Positive = 60.0
+    """(ours)"""
+    keep_checkpoints: Count = 3
+    """Newest kept; the evaluator keeps the best beside them. (ours)"""
+    sample_timeout_s: Positive = 60.0
+    """Without a batch for so long, the learner says whom it waits for. (ours)"""
+    seed: int = 0
+    """Of the initial parameters and the symmetries drawn. (ours)"""
+
+
+class EvaluatorConfig(Section):
+    """The paper's test (section 5.3), run on live weights."""
+
+    episodes: Count = 100
+    """Starts judged each time; the paper's table has 1100. (ours)"""
+    epsilon: Fraction = 0.01
+    """(paper)"""
+    period_s: Annotated[float, Field(ge=0)] = 30.0
+    """From the start of one evaluation to the next at the earliest. (ours)"""
+    seed: int = 1
+    """Of the start states: the same for every version. (ours)"""
+    threads: Count = 1
+    """Torch threads. (ours)"""
+
+
+class RunConfig(Section):
+    """One run of `mrcdrl train`."""
+
+    actors: Annotated[int, Field(ge=0)] = 0
+    """Actor processes; 0: from the cores. (ours)"""
+    evaluators: Annotated[int, Field(ge=0)] = 1
+    """Evaluator processes. (ours)"""
+    seed: int = 0
+    """Of the arenas. (ours)"""
+    minutes: Annotated[float, Field(ge=0)] = 0
+    """Ends the run after so long; 0: never. (ours)"""
+    learner_steps: Annotated[int, Field(ge=0)] = 0
+    """Ends the run at this many; 0: never. (ours)"""
+    target_success_rate: Fraction = 0
+    """Ends the run at the first evaluation that reaches this; 0: never. (ours)"""
+    patience_episodes: Annotated[int, Field(ge=0)] = 1000
+    """The paper's stopping rule (section 5.2): ends the run when the successes of 100 episodes
+    reached no new maximum in so many episodes; 0: never. (paper)"""
+    patience_floor: Fraction = 0.5
+    """The rule acts only after this share of 100 episodes succeeded: before learning takes
+    hold there is no maximum to wait for. ("when a certain size is satisfied"; value ours)"""
+
+
+class TransportConfig(Section):
+    """Zenoh."""
+
+    connect: tuple[str, ...] = ()
+    """Endpoints to connect to, such as tcp/127.0.0.1:7447. (ours)"""
+    listen: tuple[str, ...] = ()
+    """Endpoints to listen on; the replay process of one machine. (ours)"""
+    timeout_s: Positive = 10.0
+    """Deadline of one query. (ours)"""
+    max_message_bytes: Count = 64 << 20
+    """Larger messages are refused. (ours)"""
+    shared_memory: bool = False
+    """Zenoh's implicit shared memory for large messages on one host. (ours)"""
+
+
+class Config(Section):
+    """The whole configuration of a run."""
+
+    arena: ArenaConfig = ArenaConfig()
+    agent: AgentConfig = AgentConfig()
+    exploration: ExplorationConfig = ExplorationConfig()
+    replay: ReplayConfig = ReplayConfig()
+    actor: ActorConfig = ActorConfig()
+    learner: LearnerConfig = LearnerConfig()
+    evaluator: EvaluatorConfig = EvaluatorConfig()
+    run: RunConfig = RunConfig()
+    transport: TransportConfig = TransportConfig()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        smallest = self.learner.batch_size
+        if self.replay.min_size < smallest:
+            raise ValueError(
+                f"replay.min_size {self.replay.min_size} is below learner.batch_size {smallest}: "
+                "the first batch would repeat transitions"
+            )
+        return self
+
+
+def sections() -> dict[str, type[Section]]:
+    """Section name to its class, in the order of the file."""
+    return {
+        name: cast(type[Section], info.annotation) for name, info in Config.model_fields.items()
+    }
+
+
+def preset_names() -> list[str]:
+    """Names that `--config` takes besides a path."""
+    files = resources.files("configs").iterdir()
+    return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
+
+
+def _unknown(name: str, known: Sequence[str], what: str, where: str) -> ConfigError:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
+    return ConfigError(f"{where}: unknown {what} {name!r}{hint}")
+
+
+def _read_toml(source: str) -> tuple[dict[str, Any], str]:
+    """The table of a preset or file, with what it extends merged below it; and its name."""
+    path = Path(source)
+    if source in preset_names():
+        text = (resources.files("configs") / f"{source}.toml").read_text("utf-8")
+    else:
+        try:
+            text = path.read_text("utf-8")
+        except OSError as error:
+            presets = ", ".join(preset_names())
+            reason = error.strerror or str(error)
+            raise ConfigError(
+                f"config {source!r}: {reason}; give a file or a preset: {presets}"
+            ) from error
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"config {source!r} is not TOML: {error}") from error
+    base = table.pop(EXTENDS, None)
+    if base is None:
+        return table, source
+    if base == source:
+        raise ConfigError(f"config {source!r} extends itself")
+    below, _ = _read_toml(str(base))
+    for section, values in table.items():
+        below[section] = (
+            {**below.get(section, {}), **values} if isinstance(values, dict) else values
+        )
+    return below, source
+
+
+def _check_names(table: Mapping[str, Any], where: str) -> None:
+    known = sections()
+    for section, values in table.items():
+        if section not in known:
+            raise _unknown(section, list(known), "section", where)
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"{where}: {section} is a section, not a value")
+        fields = list(known[section].model_fields)
+        for name in values:
+            if name not in fields:
+                every = [f"{s}.{f}" for s, c in known.items() for f in c.model_fields]
+                candidates = [f"{section}.{f}" for f in fields] + every
+                raise _unknown(f"{section}.{name}", candidates, "setting", where)
+
+
+def _parse_value(text: str) -> Any:
+    """A value from a flag or the environment: TOML if it is, else the plain string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _merge_text(table: dict[str, Any], dotted: str, text: str, where: str) -> None:
+    section, _, name = dotted.partition(".")
+    value = {section: {name: _parse_value(text)}} if name else {section: {}}
+    if not name:
+        raise ConfigError(f"{where}: {dotted!r} is no setting; write SECTION.FIELD")
+    _check_names(value, where)
+    table[section] = {**table.get(section, {}), **value[section]}
+
+
+def environment_overrides(environ: Mapping[str, str]) -> dict[str, str]:
+    """`MRCDRL_LEARNER__BATCH_SIZE=64` as {"learner.batch_size": "64"}."""
+    return {
+        key.removeprefix(ENV_PREFIX).lower().replace("__", ".", 1): value
+        for key, value in environ.items()
+        if key.startswith(ENV_PREFIX) and "__" in key
+    }
+
+
+def load_config(
+    source: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+    environ: Mapping[str, str] | None = None,
+) -> Config:
+    """The resolved configuration.
+
+    source: a preset's name or a TOML file; None: the defaults. overrides: "section.field" to
+    text, as flags give them. environ: the process's environment unless given.
+
+    Raises ConfigError, one line, naming the setting, what is wrong and what is right.
+    """
+    table: dict[str, Any] = {}
+    if source is not None:
+        table, name = _read_toml(source)
+        _check_names(table, f"config {name!r}")
+    env = environment_overrides(os.environ if environ is None else environ)
+    for dotted, text in env.items():
+        _merge_text(table, dotted, text, "environment")
+    for dotted, text in (overrides or {}).items():
+        _merge_text(table, dotted, text, "flag")
+    return validate_config(table)
+
+
+def validate_config(table: Mapping[str, Any]) -> Config:
+    """A Config from its table; raises ConfigError naming the first setting that is wrong."""
+    try:
+        return Config.model_validate(table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "configuration"
+        message = first["msg"].removeprefix("Value error, ")
+        given = first.get("input")
+        shown = "" if isinstance(given, (dict, BaseModel)) else f" (given {given!r})"
+        raise ConfigError(f"{where}: {message}{shown}") from None
+
+
+def to_toml(config: Config) -> str:
+    """The configuration as a TOML file that reads back to the same."""
+    lines: list[str] = []
+    for section, values in config.model_dump().items():
+        lines.append(f"[{section}]")
+        lines += [f"{name} = {_toml_value(value)}" for name, value in values.items()]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    return repr(value)

@@ -1,0 +1,172 @@
+"""The nouns of the data path: what an actor records, what replay keeps, what a learner reads.
+
+Invariants: every array's dtype and shape is declared here and nowhere else; instances are
+frozen; nothing here knows of a clock, a lock or a transport.
+
+Shapes: H = frames stacked in one state - 1, T = transitions of a chunk, n = longest n-step
+return, W = H + 1 + n records that one transition may touch, B = transitions of a batch,
+K = robots of an arena, R = bytes of one observation record.
+"""
+
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+UInt8Array = NDArray[np.uint8]
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+Int64Array = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+class StepType(IntEnum):
+    """Position of a time step in its episode (dm_env's terms)."""
+
+    FIRST = 0
+    MID = 1
+    LAST = 2
+
+
+class Outcome(StrEnum):
+    """How an episode ended."""
+
+    SUCCESS = "success"
+    COLLISION = "collision"
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True, slots=True)
+class TimeStep:
+    """What one arena returns for all of its robots after a reset or a step."""
+
+    step_type: StepType
+    records: UInt8Array  # [K, R], one observation record a robot
+    rewards: Float32Array  # [K], zero at FIRST
+    discount: float  # 0 after a termination (success, failure), else 1; gamma is the agent's
+    collided: BoolArray  # [K], whose move was undone in this frame
+    outcome: Outcome | None = None  # set at LAST
+
+    @property
+    def first(self) -> bool:
+        return self.step_type is StepType.FIRST
+
+    @property
+    def last(self) -> bool:
+        return self.step_type is StepType.LAST
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Consecutive transitions of one robot that stand alone: history before, bootstrap after.
+
+    Transition t (0 <= t < T) has state records[t : t + H + 1], action actions[t], n-step return
+    rewards[t], and bootstraps with discounts[t] from the state
+    records[t + k : t + k + H + 1], k = bootstrap_offsets[t]. At an episode's start its first
+    record, and at its end its last, is repeated to fill the window.
+    """
+
+    actor: str
+    incarnation: int  # differs for every start of the same actor
+    sequence: int  # 0, 1, 2, … without gaps within an incarnation
+    weights_version: int  # the oldest version that chose one of these actions
+    records: UInt8Array  # [H + T + n, R]
+    actions: UInt8Array  # [T]
+    rewards: Float32Array  # [T], sum of k discounted rewards
+    discounts: Float32Array  # [T], gamma**k, or 0 where the episode terminated
+    bootstrap_offsets: UInt8Array  # [T], k, 1..n
+    priorities: Float32Array  # [T], initial priorities (absolute TD errors), or [0]
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Transitions drawn from the table, still as records."""
+
+    keys: Int64Array  # [B], names the transition for a priority update
+    probabilities: Float64Array  # [B], of having been drawn
+    table_size: int  # transitions in the table when drawn
+    records: UInt8Array  # [B, W, R]
+    actions: UInt8Array  # [B]
+    rewards: Float32Array  # [B]
+    discounts: Float32Array  # [B]
+    bootstrap_offsets: UInt8Array  # [B]
+    weights_versions: Int64Array  # [B], of the chunk the transition came from
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True, slots=True)
+class InsertReply:
+    """Replay's acknowledgement: the chunk is stored (or was before)."""
+
+    sequence: int
+    duplicate: bool
+    inserts: int  # transitions accepted since the run began
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """The network's parameters as published; newer means a larger (epoch, version)."""
+
+    epoch: int  # rises when a run's learner starts from new parameters
+    version: int  # rises with every publication, also over restarts
+    learner_step: int
+    payload: bytes  # safetensors: float32 arrays by parameter name
+
+    @property
+    def order(self) -> tuple[int, int]:
+        return (self.epoch, self.version)
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSummary:
+    """One finished training episode."""
+
+    actor: str
+    arena: int
+    episode: int  # counts this actor's episodes
+    outcome: Outcome
+    frames: int  # env steps of the episode
+    score: float  # sum of rewards, mean over robots (Fig. 6a)
+    collisions: int
+    epsilon: float
+    weights_version: int
+    mean_q: float  # mean over the episode of the greedy action's value (Fig. 7a-c)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Result of the paper's test (section 5.3) for one version of the weights."""
+
+    worker: str
+    weights_epoch: int
+    weights_version: int
+    learner_step: int
+    num_robots: int
+    episodes: int
+    success_rate: float
+    collision_rate: float
+    timeout_rate: float
+    success_interval: tuple[float, float]  # 95 % Wilson interval of success_rate
+    max_per_100: float
+    mean_per_100: float
+    variance_per_100: float
+    mean_frames: float  # to success
+    mean_score: float
+    seed: int
+    wall_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """What a service says of itself once a second; the metrics' names are in docs/metrics.md."""
+
+    role: str
+    id: str
+    metrics: dict[str, float]
+    text: dict[str, str] = field(default_factory=dict)

@@ -1,0 +1,1 @@
+"""One folder a process; each `__main__` reads the configuration, wires by hand and runs."""
