@@ -93,6 +93,13 @@ class ArenaConfig(Section):
     codec: Literal["scene", "frames"] = "scene"
     """What an observation record holds: poses from which the picture is drawn, or pixels. (ours)"""
 
+    @property
+    def record_bytes(self) -> int:
+        """Length of one observation record: the pixels, or own pose, other poses and targets."""
+        if self.codec == "frames":
+            return self.view_px * self.view_px
+        return 4 * (3 * self.num_robots + 2 * self.num_robots)
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         inner = self.size_px - 2 * (self.wall_offset_px + self.wall_thickness_px)
@@ -189,9 +196,9 @@ class ActorConfig(Section):
     """Arenas stepped together, one batched inference for all their robots. (ours)"""
     chunk_length: Annotated[int, Field(ge=1, le=1024)] = 50
     """Transitions a chunk. (Ape-X)"""
-    spool_chunks: Count = 64
+    spool_chunks: Count = 8
     """Chunks waiting to be acknowledged before the arenas stop: nothing is dropped. (ours)"""
-    insert_timeout_s: Positive = 60.0
+    warn_s: Positive = 10.0
     """Without an acknowledgement for so long, the actor says whom it waits for. (ours)"""
     threads: Count = 1
     """Torch threads. (ours)"""
@@ -222,7 +229,7 @@ class LearnerConfig(Section):
     """(ours)"""
     keep_checkpoints: Count = 3
     """Newest kept; the evaluator keeps the best beside them. (ours)"""
-    sample_timeout_s: Positive = 60.0
+    warn_s: Positive = 10.0
     """Without a batch for so long, the learner says whom it waits for. (ours)"""
     seed: int = 0
     """Of the initial parameters and the symmetries drawn. (ours)"""
@@ -416,6 +423,14 @@ def load_config(
     for dotted, text in env.items():
         _merge_text(table, dotted, text, "environment")
     for dotted, text in (overrides or {}).items():
+        _merge_text(table, dotted, text, "flag")
+    return validate_config(table)
+
+
+def apply_overrides(config: Config, overrides: Mapping[str, str]) -> Config:
+    """The configuration with "section.field" set to text, checked as a whole again."""
+    table = config.model_dump()
+    for dotted, text in overrides.items():
         _merge_text(table, dotted, text, "flag")
     return validate_config(table)
 

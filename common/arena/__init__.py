@@ -1,0 +1,62 @@
+"""The paper's 2-D arena: physics, rewards, starts and the robots' pictures.
+
+Invariants: the only package that imports pymunk or OpenCV; it knows of no network and no service.
+"""
+
+from common.arena.arena import Arena, make_arena
+from common.arena.codec import FrameCodec, ObservationCodec, SceneCodec, make_codec
+from common.arena.controllers import Controller, controller, greedy_actions, random_actions
+from common.arena.counting import (
+    Counters,
+    CountingArena,
+    counting_frames,
+    counting_outcome,
+    counting_reward,
+    decode_counters,
+)
+from common.arena.layout import fixed_layout, layout_for, layout_symmetries
+from common.arena.physics import World
+from common.arena.rendering import draw_arena, literal_views
+from common.arena.rewards import frame_rewards, target_distances_px
+from common.arena.scene import LEFT, NUM_ACTIONS, RIGHT, STRAIGHT, Scene, Start
+from common.arena.starts import test_starts, training_start
+from common.arena.symmetry import IDENTITY, Symmetry
+from common.arena.views import AnalyticViews
+
+__all__ = [
+    "IDENTITY",
+    "LEFT",
+    "NUM_ACTIONS",
+    "RIGHT",
+    "STRAIGHT",
+    "AnalyticViews",
+    "Arena",
+    "Controller",
+    "Counters",
+    "CountingArena",
+    "FrameCodec",
+    "ObservationCodec",
+    "Scene",
+    "SceneCodec",
+    "Start",
+    "Symmetry",
+    "World",
+    "controller",
+    "counting_frames",
+    "counting_outcome",
+    "counting_reward",
+    "decode_counters",
+    "draw_arena",
+    "fixed_layout",
+    "frame_rewards",
+    "greedy_actions",
+    "layout_for",
+    "layout_symmetries",
+    "literal_views",
+    "make_arena",
+    "make_codec",
+    "random_actions",
+    "target_distances_px",
+    "test_starts",
+    "training_start",
+]

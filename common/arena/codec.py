@@ -1,0 +1,113 @@
+"""What an observation record holds, and how its picture is got back.
+
+Invariants: both codecs give the same pixels for the same scene, because both draw from the scene
+rounded to float32; a record is a fixed number of bytes.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from common.arena.rendering import literal_views
+from common.arena.scene import Scene
+from common.arena.views import AnalyticViews
+from common.config import ArenaConfig
+from common.trajectory import Float32Array, UInt8Array
+
+_NUMBER = np.dtype("<f4")
+
+
+class ObservationCodec(Protocol):
+    """Turns a scene into one record a robot, and records into pictures."""
+
+    record_bytes: int
+
+    def encode(self, scene: Scene) -> UInt8Array:
+        """Records [K, R] of the robots' views."""
+        ...
+
+    def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
+        """Pictures [..., V, V] of records [..., R], in out (C-contiguous) if given."""
+        ...
+
+
+class SceneCodec:
+    """A record is the scene as its robot lists it; the picture is drawn when it is needed.
+
+    float32, little-endian: own x, y, heading; x, y, heading of the other robots in their order;
+    x, y of the targets.
+    """
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self._config = config
+        num = config.num_robots
+        self.record_bytes = _NUMBER.itemsize * 5 * num
+        self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
+        self._views = AnalyticViews(config) if config.renderer == "analytic" else None
+
+    def __repr__(self) -> str:
+        return f"SceneCodec(record_bytes={self.record_bytes})"
+
+    def encode(self, scene: Scene) -> UInt8Array:
+        num = len(self._order)
+        numbers = np.empty((num, 5 * num), _NUMBER)
+        numbers[:, : 3 * num] = scene.robots[self._order].reshape(num, 3 * num)
+        numbers[:, 3 * num :] = scene.targets.reshape(2 * num)
+        return numbers.view(np.uint8)
+
+    def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
+        pictures = _pictures(records, self.record_bytes, self._config.view_px, out)
+        flat = np.require(records.reshape(-1, self.record_bytes), requirements=["C", "A", "W"])
+        scenes = flat.view(_NUMBER)
+        views = pictures.reshape(-1, *pictures.shape[-2:])
+        if self._views is not None:
+            self._views.draw(scenes, views)
+        else:
+            for view, scene in zip(views, scenes, strict=True):
+                view[:] = literal_views(self._scene_of(scene), self._config)[0]
+        return pictures
+
+    def _scene_of(self, numbers: Float32Array) -> Scene:
+        robots, targets = np.split(numbers.astype(np.float64), [3 * len(self._order)])
+        return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2))
+
+
+class FrameCodec:
+    """A record is the picture's pixels, row by row."""
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self._config = config
+        self._scenes = SceneCodec(config)
+        self.record_bytes = config.view_px**2
+
+    def __repr__(self) -> str:
+        return f"FrameCodec(record_bytes={self.record_bytes})"
+
+    def encode(self, scene: Scene) -> UInt8Array:
+        return self._scenes.decode(self._scenes.encode(scene)).reshape(-1, self.record_bytes)
+
+    def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
+        pictures = _pictures(records, self.record_bytes, self._config.view_px, out)
+        pictures[:] = records.reshape(pictures.shape)
+        return pictures
+
+
+def make_codec(config: ArenaConfig) -> ObservationCodec:
+    """The codec that config.codec names."""
+    return SceneCodec(config) if config.codec == "scene" else FrameCodec(config)
+
+
+def _pictures(
+    records: UInt8Array, record_bytes: int, view_px: int, out: UInt8Array | None
+) -> UInt8Array:
+    """out, or new pictures, for records; raises ValueError when either does not fit."""
+    if records.dtype != np.uint8 or records.shape[-1:] != (record_bytes,):
+        raise ValueError(
+            f"records are {records.dtype} {records.shape}, not uint8 [..., {record_bytes}]"
+        )
+    shape = (*records.shape[:-1], view_px, view_px)
+    if out is None:
+        return np.empty(shape, np.uint8)
+    if out.dtype != np.uint8 or out.shape != shape or not out.flags.c_contiguous:
+        raise ValueError(f"out is {out.dtype} {out.shape}, not C-contiguous uint8 {shape}")
+    return out

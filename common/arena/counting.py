@@ -1,0 +1,131 @@
+"""An arena whose pictures say which they are, so that a test proves none is torn or misplaced.
+
+Invariants: everything is a function of (identity, episode, step), actions play no part; a picture
+repeats its counters from the first pixel to the last, and a magic byte tells it from an empty one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from common.arena.actions import checked_actions
+from common.arena.scene import Scene, Start
+from common.config import ArenaConfig
+from common.trajectory import Int64Array, Outcome, StepType, TimeStep, UInt8Array
+
+_MAGIC = 0xC5
+_COUNTERS = np.dtype(
+    [("magic", "u1"), ("robot", "u1"), ("identity", "<u2"), ("episode", "<u4"), ("step", "<u4")]
+)
+_LONGEST = 23
+
+
+@dataclass(frozen=True, slots=True)
+class Counters:
+    """What pictures [..., V, V] say of themselves."""
+
+    identity: Int64Array  # [...]
+    robot: Int64Array  # [...]
+    episode: Int64Array  # [...], from 0
+    step: Int64Array  # [...], 0 after a reset
+
+
+def counting_frames(identity: int, episode: int) -> int:
+    """Steps of an episode, 1 to 23."""
+    return 1 + (5 * identity + 7 * episode) % _LONGEST
+
+
+def counting_outcome(identity: int, episode: int) -> Outcome:
+    """How an episode ends: terminated (success) and truncated (time-out) by turns."""
+    return Outcome.TIMEOUT if (identity + episode) % 2 else Outcome.SUCCESS
+
+
+def counting_reward(episode: int, step: int) -> float:
+    """Reward of every robot for the step that led to this count; exact in float32."""
+    return step + episode % 8 / 8
+
+
+class CountingArena:
+    """The interface of Arena, with counters for pictures."""
+
+    def __init__(self, config: ArenaConfig, *, identity: int = 0) -> None:
+        if not 0 <= identity < 2**16:
+            raise ValueError(f"identity {identity} is not in 0..65535")
+        self._num_robots = config.num_robots
+        self._view_px = config.view_px
+        self._identity = identity
+        self._episode = -1
+        self._running = False
+        self.frame = 0
+        self.collisions = 0
+
+    def __repr__(self) -> str:
+        return (
+            f"CountingArena(identity={self._identity}, episode={self._episode}, frame={self.frame})"
+        )
+
+    @property
+    def scene(self) -> Scene:
+        """Robots and targets that stay at the origin."""
+        return Scene(np.zeros((self._num_robots, 3)), np.zeros((self._num_robots, 2)))
+
+    def reset(self, start: Start | None = None) -> TimeStep:
+        """Begins the next episode; a start is taken and plays no part."""
+        self._episode += 1
+        self._running = True
+        self.frame = 0
+        return self._time_step(StepType.FIRST, 0.0, None)
+
+    def step(self, actions: ArrayLike) -> TimeStep:
+        """Counts on; actions: [K], checked as Arena does."""
+        if not self._running:
+            raise ValueError("the episode has ended or not begun: reset first")
+        checked_actions(actions, self._num_robots)
+        self.frame += 1
+        reward = counting_reward(self._episode, self.frame)
+        if self.frame < counting_frames(self._identity, self._episode):
+            return self._time_step(StepType.MID, reward, None)
+        self._running = False
+        outcome = counting_outcome(self._identity, self._episode)
+        return self._time_step(StepType.LAST, reward, outcome)
+
+    def _time_step(self, step_type: StepType, reward: float, outcome: Outcome | None) -> TimeStep:
+        return TimeStep(
+            step_type=step_type,
+            records=self._records(),
+            rewards=np.full(self._num_robots, reward, np.float32),
+            discount=0.0 if outcome is Outcome.SUCCESS else 1.0,
+            collided=np.zeros(self._num_robots, np.bool_),
+            outcome=outcome,
+        )
+
+    def _records(self) -> UInt8Array:
+        """Records [K, V * V] of the present count."""
+        counters = np.zeros(self._num_robots, _COUNTERS)
+        counters["magic"] = _MAGIC
+        counters["robot"] = np.arange(self._num_robots)
+        counters["identity"] = self._identity
+        counters["episode"] = self._episode
+        counters["step"] = self.frame
+        marks = counters.view(np.uint8).reshape(self._num_robots, -1)
+        pixels = self._view_px**2
+        return np.tile(marks, -(-pixels // _COUNTERS.itemsize))[:, :pixels].copy()
+
+
+def decode_counters(pictures: UInt8Array) -> Counters:
+    """The counters of pictures [..., V, V]; raises ValueError if one contradicts itself."""
+    leading = pictures.shape[:-2]
+    pixels = np.ascontiguousarray(pictures).reshape(-1, pictures.shape[-2] * pictures.shape[-1])
+    marks = np.ascontiguousarray(pixels[:, : _COUNTERS.itemsize])
+    repeats = -(-pixels.shape[1] // _COUNTERS.itemsize)
+    whole = (np.tile(marks, repeats)[:, : pixels.shape[1]] == pixels).all(axis=1)
+    counters = marks.view(_COUNTERS)[:, 0]
+    torn = ~whole | (counters["magic"] != _MAGIC)
+    if torn.any():
+        raise ValueError(f"{int(torn.sum())} of {len(torn)} pictures are torn or none of ours")
+
+    def field(name: str) -> Int64Array:
+        return counters[name].astype(np.int64).reshape(leading)
+
+    return Counters(field("identity"), field("robot"), field("episode"), field("step"))

@@ -1,0 +1,130 @@
+"""Where the targets stand, and which symmetries of the square leave them where they are.
+
+Invariants: every layout that leaves here can be solved: each target is near enough to a place a
+robot can reach, and no two are so near that two robots cannot stand on them together.
+"""
+
+from itertools import product
+
+import numpy as np
+
+from common.arena.symmetry import IDENTITY, Symmetry
+from common.config import ArenaConfig
+from common.errors import ConfigError
+from common.trajectory import Float64Array
+
+_LAYOUT_SIZE_PX = 600
+_TRIES = 2000
+_WALL_MARGIN_PX = 5.0
+
+_FIXED: dict[int, tuple[tuple[float, float], ...]] = {
+    1: ((300, 300),),
+    2: ((175, 300), (425, 300)),
+    3: ((300, 175), (175, 425), (425, 425)),
+    4: ((175, 175), (425, 175), (175, 425), (425, 425)),
+    5: ((150, 150), (450, 150), (300, 300), (150, 450), (450, 450)),
+    6: tuple((x, y) for y in (200, 400) for x in (120, 300, 480)),
+    7: ((210, 140), (390, 140), (120, 300), (300, 300), (480, 300), (210, 460), (390, 460)),
+    8: tuple((x, y) for y, x in product((120, 300, 480), repeat=2) if (x, y) != (300, 300)),
+    9: tuple((x, y) for y, x in product((120, 300, 480), repeat=2)),
+    10: (
+        *((x, 140) for x in (150, 300, 450)),
+        *((x, 300) for x in (75, 225, 375, 525)),
+        *((x, 460) for x in (150, 300, 450)),
+    ),
+}
+
+
+def fixed_layout(num_robots: int) -> Float64Array:
+    """Target centres [K, 2] px of the built-in layout in an arena of 600 px.
+
+    Raises ConfigError for a number without a layout.
+    """
+    if num_robots not in _FIXED:
+        raise ConfigError(f"no fixed layout for {num_robots} robots; there is one for 1 to 10")
+    return np.array(_FIXED[num_robots], np.float64)
+
+
+def layout_for(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
+    """Target centres [K, 2] px for the next episode: the fixed ones, or drawn with rng.
+
+    Raises ConfigError when no such layout fits, naming what does not.
+    """
+    if config.target_layout == "random":
+        return _random_layout(config, rng)
+    if config.targets_px:
+        targets = np.array(config.targets_px, np.float64)
+    else:
+        targets = fixed_layout(config.num_robots) * (config.size_px / _LAYOUT_SIZE_PX)
+    _check_solvable(config, targets)
+    return targets
+
+
+def layout_symmetries(config: ArenaConfig) -> tuple[Symmetry, ...]:
+    """The symmetries of the square under which an agent's experience stays true.
+
+    Unrotated pictures: those that map the target layout onto itself, all 8 if targets are
+    random. Heading-up pictures: a rotation of the arena changes nothing in them, a reflection
+    mirrors them left to right; so the identity, and the mirror if a reflection maps the layout
+    onto itself.
+    """
+    every = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3))
+    if config.target_layout == "random":
+        kept = every
+    else:
+        targets = layout_for(config, np.random.default_rng(0))
+        kept = tuple(s for s in every if _maps_onto_itself(s, targets, config.size_px))
+    if config.orientation == "unrotated":
+        return kept
+    mirror = Symmetry(transpose=False, flip_x=True, flip_y=False)
+    return (IDENTITY, mirror) if any(s.mirrors for s in kept) else (IDENTITY,)
+
+
+def reachable_px(config: ArenaConfig) -> tuple[float, float]:
+    """Least and greatest coordinate at which a robot's centre can be."""
+    low = config.wall_offset_px + config.wall_thickness_px + config.robot_radius_px
+    return low, config.size_px - low
+
+
+def _random_layout(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
+    low, high = reachable_px(config)
+    low, high = low + _WALL_MARGIN_PX, high - _WALL_MARGIN_PX
+    apart = 2 * config.robot_radius_px + 2 * config.success_radius_px
+    for _ in range(_TRIES if high >= low else 0):
+        targets = rng.uniform(low, high, (config.num_robots, 2))
+        if _nearest_pair_px(targets) >= apart:
+            return targets
+    raise ConfigError(
+        f"{config.num_robots} random targets {apart:g} px apart do not fit in an arena of "
+        f"{config.size_px} px; fewer robots or a larger arena"
+    )
+
+
+def _check_solvable(config: ArenaConfig, targets: Float64Array) -> None:
+    low, high = reachable_px(config)
+    way = np.hypot(*(targets - np.clip(targets, low, high)).T)
+    if (way >= config.success_radius_px).any():
+        x, y = targets[int(way.argmax())]
+        raise ConfigError(
+            f"target ({x:g}, {y:g}) cannot be reached: robots' centres stay between {low:g} and "
+            f"{high:g} px, success needs {config.success_radius_px:g} px"
+        )
+    nearest = _nearest_pair_px(targets)
+    if nearest + 2 * config.success_radius_px <= 2 * config.robot_radius_px:
+        raise ConfigError(
+            f"targets {nearest:g} px apart: two robots of radius {config.robot_radius_px:g} px "
+            f"cannot both be within {config.success_radius_px:g} px of them"
+        )
+
+
+def _nearest_pair_px(targets: Float64Array) -> float:
+    first, second = np.triu_indices(len(targets), 1)
+    if not len(first):
+        return float("inf")
+    return float(np.hypot(*(targets[first] - targets[second]).T).min())
+
+
+def _maps_onto_itself(symmetry: Symmetry, targets: Float64Array, size_px: float) -> bool:
+    image = symmetry.apply_to_points(targets, size_px)
+    gaps = np.abs(image[:, None] - targets[None]).max(axis=2)
+    return bool((gaps.min(axis=1) < 1e-6).all())

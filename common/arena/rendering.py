@@ -1,0 +1,103 @@
+"""Draws the arena with OpenCV, and cuts the robots' pictures out of it as the paper does.
+
+Invariants: a place x of the arena is drawn at OpenCV's coordinate x - 1/2, because OpenCV counts
+pixel centres and the arena counts from pixel edges; filled shapes cover the area they have in the
+world (OpenCV paints a disc's rim too, so discs are drawn half a pixel smaller).
+"""
+
+import math
+
+import cv2
+import numpy as np
+
+from common.arena.scene import Scene
+from common.arena.views import HEADING_WIDTH_PX
+from common.config import ArenaConfig
+from common.trajectory import UInt8Array
+
+BLACK = (0, 0, 0)
+WHITE = (255, 255, 255)
+RED = (0, 0, 255)
+BLUE = (255, 0, 0)
+_SHIFT = 8  # fractional bits of OpenCV's coordinates
+
+
+def draw_arena(
+    scene: Scene, config: ArenaConfig, size: int = 600, *, smooth: bool = False
+) -> UInt8Array:
+    """The arena as BGR [size, size, 3]; smooth: anti-aliased, for people to look at."""
+    scale = size / config.size_px
+    picture = np.zeros((size, size, 3), np.uint8)
+    line_type = cv2.LINE_AA if smooth else cv2.LINE_8
+    outer = config.wall_offset_px
+    inner = outer + config.wall_thickness_px
+    _fill(picture, outer * scale, size - outer * scale, RED)
+    _fill(picture, inner * scale, size - inner * scale, BLACK)
+    half = config.target_size_px / 2
+    for x, y in scene.targets.tolist():
+        corners = np.array([[x - half, y - half], [x + half, y + half]]) * scale
+        (left, top), (right, bottom) = np.rint(corners).astype(int).tolist()
+        picture[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = BLUE
+    radius = config.robot_radius_px * scale
+    for x, y, _ in scene.robots.tolist():
+        at = _fixed(x * scale, y * scale)
+        cv2.circle(picture, at, round((radius - 0.5) * 2**_SHIFT), WHITE, -1, line_type, _SHIFT)
+    width = max(1, round(HEADING_WIDTH_PX * scale))
+    for x, y, heading in scene.robots.tolist():
+        rim = (x * scale + radius * math.cos(heading), y * scale + radius * math.sin(heading))
+        start = _fixed(x * scale, y * scale)
+        cv2.line(picture, start, _fixed(*rim), BLACK, width, line_type, _SHIFT)
+    return picture
+
+
+def literal_views(scene: Scene, config: ArenaConfig) -> UInt8Array:
+    """Pictures [K, V, V] by the paper's steps (section 4, Fig. 3).
+
+    The arena is drawn one pixel a px, greyed, the rectangle centred on the robot (rounded to
+    whole pixels) cut out with zeros beyond the border, and resized by area.
+    """
+    picture = draw_arena(scene, config, config.size_px)
+    grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+    views = np.empty((len(scene.robots), config.view_px, config.view_px), np.uint8)
+    for i, (x, y, heading) in enumerate(scene.robots.tolist()):
+        window = (
+            _turned_window(grey, x, y, heading, config)
+            if config.orientation == "heading_up"
+            else _window(grey, x, y, config)
+        )
+        size = (config.view_px, config.view_px)
+        views[i] = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
+    return views
+
+
+def _window(grey: UInt8Array, x: float, y: float, config: ArenaConfig) -> UInt8Array:
+    """The square of crop_px around (x, y), zeros beyond the border."""
+    width = round(config.crop_px)
+    left, top = round(x - config.crop_px / 2), round(y - config.crop_px / 2)
+    window = np.zeros((width, width), np.uint8)
+    height, length = grey.shape
+    x0, x1 = max(left, 0), min(left + width, length)
+    y0, y1 = max(top, 0), min(top + width, height)
+    window[y0 - top : y1 - top, x0 - left : x1 - left] = grey[y0:y1, x0:x1]
+    return window
+
+
+def _turned_window(
+    grey: UInt8Array, x: float, y: float, heading: float, config: ArenaConfig
+) -> UInt8Array:
+    """The square of crop_px around (x, y), turned so that the heading points up."""
+    width = round(config.crop_px)
+    c, s = -math.sin(heading), -math.cos(heading)
+    x, y = x - 0.5, y - 0.5  # in OpenCV's coordinates
+    centre = config.crop_px / 2 - 0.5
+    turn = np.array([[c, -s, centre - c * x + s * y], [s, c, centre - s * x - c * y]])
+    return np.asarray(cv2.warpAffine(grey, turn, (width, width)), np.uint8)
+
+
+def _fill(picture: UInt8Array, low: float, high: float, colour: tuple[int, int, int]) -> None:
+    picture[round(low) : round(high), round(low) : round(high)] = colour
+
+
+def _fixed(x: float, y: float) -> tuple[int, int]:
+    """A place in OpenCV's fixed-point coordinates."""
+    return round((x - 0.5) * 2**_SHIFT), round((y - 0.5) * 2**_SHIFT)

@@ -1,0 +1,34 @@
+"""What there is to see: the state of the world at one frame, and the words for actions.
+
+Invariants: coordinates are continuous pixels of the arena, x to the right and y down as in
+images, pixel i covering [i, i + 1); a heading of 0 looks along +x and grows clockwise to the
+viewer, because y points down.
+"""
+
+from dataclasses import dataclass
+
+from common.trajectory import Float64Array
+
+LEFT = 0
+"""Heading decreases by `turn_deg`: anticlockwise to the viewer. Then the robot moves on."""
+STRAIGHT = 1
+"""Moves on."""
+RIGHT = 2
+"""Heading increases by `turn_deg`: clockwise to the viewer. Then the robot moves on."""
+NUM_ACTIONS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Poses of K robots and places of M targets."""
+
+    robots: Float64Array  # [K, 3], x px, y px, heading rad
+    targets: Float64Array  # [M, 2], x px, y px
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where an episode begins: the same arrays as a scene's."""
+
+    robots: Float64Array  # [K, 3], x px, y px, heading rad
+    targets: Float64Array  # [M, 2], x px, y px

@@ -1,0 +1,87 @@
+"""Where robots begin: at random in training, and by the paper's rule in the test (section 5.3).
+
+Invariants: starts never overlap nor touch a wall from beyond; the same configuration and seed
+give the same starts in every process.
+"""
+
+import math
+
+import numpy as np
+
+from common.arena.layout import layout_for, reachable_px
+from common.arena.scene import Start
+from common.config import ArenaConfig
+from common.errors import ConfigError
+from common.trajectory import BoolArray, Float64Array
+
+_CANDIDATES = 32  # poses drawn at once for one robot
+_RESTARTS = 200  # of a placement that got stuck
+
+
+def training_start(config: ArenaConfig, targets: Float64Array, rng: np.random.Generator) -> Start:
+    """A start with random poses; targets: [M, 2] px.
+
+    Raises ConfigError when the robots do not fit.
+    """
+    return Start(_place(config, rng, num_turns=0), targets)
+
+
+def test_starts(config: ArenaConfig, num: int, seed: int) -> tuple[Start, ...]:
+    """Starts of the paper's test: no collision at the start nor within one rotation.
+
+    One rotation: all robots turn left every frame until each has gone through a full circle.
+    Random targets are drawn from the seed too. Raises ConfigError when the robots do not fit.
+    """
+    rng = np.random.default_rng(seed)
+    num_turns = math.ceil(360 / config.turn_deg)
+    starts = []
+    for _ in range(num):
+        targets = layout_for(config, rng)
+        starts.append(Start(_place(config, rng, num_turns), targets))
+    return tuple(starts)
+
+
+def _place(config: ArenaConfig, rng: np.random.Generator, num_turns: int) -> Float64Array:
+    """Poses [K, 3] that stay clear while all robots turn left for num_turns frames."""
+    for _ in range(_RESTARTS):
+        poses = np.empty((config.num_robots, 3))
+        paths = np.empty((config.num_robots, num_turns + 1, 2))
+        for i in range(config.num_robots):
+            candidates = _random_poses(config, rng)
+            ways = _circle_paths(config, candidates, num_turns)
+            clear = _clear(config, ways, paths[:i])
+            if not clear.any():
+                break
+            chosen = int(clear.argmax())
+            poses[i], paths[i] = candidates[chosen], ways[chosen]
+        else:
+            return poses
+    raise ConfigError(
+        f"{config.num_robots} robots of radius {config.robot_radius_px:g} px do not fit in an "
+        f"arena of {config.size_px} px; fewer robots or a larger arena"
+    )
+
+
+def _random_poses(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
+    """Candidates [C, 3]."""
+    low, high = reachable_px(config)
+    return rng.uniform((low, low, -np.pi), (high, high, np.pi), (_CANDIDATES, 3))
+
+
+def _circle_paths(config: ArenaConfig, poses: Float64Array, num_turns: int) -> Float64Array:
+    """Places [C, num_turns + 1, 2] of poses [C, 3] that turn left every frame."""
+    turns = np.arange(1, num_turns + 1) * math.radians(config.turn_deg)
+    headings = poses[:, 2:] - turns
+    steps = config.step_px * np.stack([np.cos(headings), np.sin(headings)], axis=2)
+    start = poses[:, None, :2]
+    return np.concatenate([start, start + steps.cumsum(axis=1)], axis=1)
+
+
+def _clear(config: ArenaConfig, ways: Float64Array, placed: Float64Array) -> BoolArray:
+    """Which ways [C, T, 2] keep off the walls and off the placed ways [P, T, 2]; [C]."""
+    low, high = reachable_px(config)
+    inside = ((ways >= low) & (ways <= high)).all(axis=(1, 2))
+    gaps = ways[:, None] - placed[None]
+    apart = (gaps * gaps).sum(axis=3) >= (2 * config.robot_radius_px) ** 2
+    clear: BoolArray = np.logical_and(inside, apart.all(axis=(1, 2)))
+    return clear

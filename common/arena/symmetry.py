@@ -1,0 +1,65 @@
+"""The eight symmetries of the square, as they act on pictures, actions and scenes.
+
+Invariants: transpose comes first, then the flips; picture and scene are mapped alike, so that
+the picture of the mapped scene is the mapped picture of the scene.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arena.scene import NUM_ACTIONS, Scene
+from common.trajectory import Float64Array, UInt8Array
+
+
+@dataclass(frozen=True, slots=True)
+class Symmetry:
+    """One of the 8 symmetries of the arena about its centre."""
+
+    transpose: bool  # x and y change places
+    flip_x: bool  # left and right change places
+    flip_y: bool  # top and bottom change places
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether it turns left into right, so that the actions must be swapped."""
+        return self.transpose ^ self.flip_x ^ self.flip_y
+
+    def apply_to_pictures(self, pictures: UInt8Array) -> UInt8Array:
+        """Pictures [..., V, V] as the mapped scene would show them; a contiguous copy."""
+        if self.transpose:
+            pictures = pictures.swapaxes(-1, -2)
+        if self.flip_x:
+            pictures = pictures[..., ::-1]
+        if self.flip_y:
+            pictures = pictures[..., ::-1, :]
+        return np.array(pictures, order="C")
+
+    def apply_to_actions(self, actions: UInt8Array) -> UInt8Array:
+        """Actions [...] that do in the mapped scene what the given ones did."""
+        return (NUM_ACTIONS - 1 - actions).astype(np.uint8) if self.mirrors else actions.copy()
+
+    def apply_to_points(self, points: Float64Array, size_px: float) -> Float64Array:
+        """Points [N, 2] px of an arena of size_px, mapped."""
+        x, y = points.T
+        if self.transpose:
+            x, y = y, x
+        return np.stack(
+            [size_px - x if self.flip_x else x, size_px - y if self.flip_y else y], axis=1
+        )
+
+    def apply_to_scene(self, scene: Scene, size_px: float) -> Scene:
+        """The scene of an arena of size_px, mapped."""
+        headings = scene.robots[:, 2]
+        if self.transpose:
+            headings = np.pi / 2 - headings
+        if self.flip_x:
+            headings = np.pi - headings
+        if self.flip_y:
+            headings = -headings
+        places = self.apply_to_points(scene.robots[:, :2], size_px)
+        robots = np.concatenate([places, headings[:, None]], axis=1)
+        return Scene(robots, self.apply_to_points(scene.targets, size_px))
+
+
+IDENTITY = Symmetry(transpose=False, flip_x=False, flip_y=False)

@@ -1,0 +1,239 @@
+"""Draws every robot's picture straight from poses: the area each shape covers of each pixel.
+
+Invariants: a picture pixel is the mean over its square of crop_px / view_px arena pixels; the
+window is centred exactly on the robot; shapes are painted over one another in the order wall,
+targets, robots, headings on a black floor, and black lies outside the arena. Coordinates are
+continuous (pixel i covers [i, i + 1)), so a mapped scene gives the mapped picture. Records of
+any bytes give some picture: what is not finite is not drawn.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from common.config import ArenaConfig
+from common.trajectory import Float32Array, UInt8Array
+
+WALL_GREY = 76  # red, green, blue and white by OpenCV's weights
+TARGET_GREY = 29
+ROBOT_GREY = 255
+HEADING_GREY = 0
+HEADING_WIDTH_PX = 2.0
+_LINES_A_RADIUS = 10.0  # scan lines that sample a robot's radius
+_BAR_LINES = 4  # scan lines a pixel that sample a slanted rectangle
+
+
+class AnalyticViews:
+    """The renderer of one configuration."""
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self._num_robots = config.num_robots
+        self._heading_up = config.orientation == "heading_up"
+        scale = config.view_px / config.crop_px
+        outer = config.wall_offset_px
+        self._scale = scale
+        self._wall = (outer, outer + config.wall_thickness_px, float(config.size_px))
+        self._target_half = config.target_size_px / 2 * scale
+        self._radius = config.robot_radius_px * scale
+        self._lines = max(4, math.ceil(_LINES_A_RADIUS / self._radius))
+
+    def draw(self, scenes: Float32Array, out: UInt8Array) -> None:
+        """Fills out [N, V, V] from scenes [N, 3 K + 2 M]: own pose, other robots', targets."""
+        _draw_views(
+            scenes,
+            out,
+            self._num_robots,
+            self._heading_up,
+            self._scale,
+            self._wall,
+            self._target_half,
+            self._radius,
+            self._lines,
+        )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _draw_views(  # type: ignore[no-untyped-def]
+    scenes, out, num_robots, heading_up, scale, wall, target_half, radius, lines
+):
+    size = out.shape[1]
+    cover = np.zeros(size + 1, np.float64)
+    hand_width = 0.5 * HEADING_WIDTH_PX * scale
+    for n in range(len(scenes)):
+        scene = scenes[n]
+        view = out[n]
+        view[:] = 0
+        own_x = np.float64(scene[0])
+        own_y = np.float64(scene[1])
+        c, s = 1.0, 0.0
+        if heading_up:
+            c, s = -math.sin(scene[2]), -math.cos(scene[2])
+        # places map to (c x - s y, s x + c y) about the robot
+        if heading_up:
+            _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall)
+        else:
+            _walls_upright(view, own_x, own_y, scale, wall)
+        for j in range(3 * num_robots, len(scene), 2):
+            x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
+            if heading_up:
+                _bar(view, cover, x, y, c, s, -target_half, target_half, target_half, TARGET_GREY)
+            else:
+                _box(
+                    view,
+                    x - target_half,
+                    x + target_half,
+                    y - target_half,
+                    y + target_half,
+                    TARGET_GREY,
+                )
+        for j in range(0, 3 * num_robots, 3):
+            x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
+            _disc(view, cover, x, y, radius, lines)
+        for j in range(0, 3 * num_robots, 3):
+            x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
+            if -radius < x < size + radius and -radius < y < size + radius:
+                cos, sin = math.cos(scene[j + 2]), math.sin(scene[j + 2])
+                across, along = c * cos - s * sin, s * cos + c * sin
+                _bar(view, cover, x, y, across, along, 0.0, radius, hand_width, HEADING_GREY)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _map(x, y, c, s, scale, size):  # type: ignore[no-untyped-def]
+    """Picture coordinates of a place relative to the robot."""
+    return (c * x - s * y) * scale + 0.5 * size, (s * x + c * y) * scale + 0.5 * size
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _walls_upright(view, own_x, own_y, scale, wall):  # type: ignore[no-untyped-def]
+    outer, inner, size_px = wall
+    half = 0.5 * view.shape[0]
+    left, left_in = (outer - own_x) * scale + half, (inner - own_x) * scale + half
+    right_in = (size_px - inner - own_x) * scale + half
+    right = (size_px - outer - own_x) * scale + half
+    top, top_in = (outer - own_y) * scale + half, (inner - own_y) * scale + half
+    bottom_in = (size_px - inner - own_y) * scale + half
+    bottom = (size_px - outer - own_y) * scale + half
+    _box(view, left, right, top, top_in, WALL_GREY)
+    _box(view, left, right, bottom_in, bottom, WALL_GREY)
+    _box(view, left, left_in, top_in, bottom_in, WALL_GREY)
+    _box(view, right_in, right, top_in, bottom_in, WALL_GREY)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall):  # type: ignore[no-untyped-def]
+    outer, inner, size_px = wall
+    size = view.shape[0]
+    width = 0.5 * (inner - outer) * scale
+    length = (size_px - 2 * outer) * scale
+    short = (size_px - 2 * inner) * scale
+    near = 0.5 * (outer + inner)
+    far = size_px - near
+    for at in (near, far):
+        x, y = _map(outer - own_x, at - own_y, c, s, scale, size)
+        _bar(view, cover, x, y, c, s, 0.0, length, width, WALL_GREY)
+        x, y = _map(at - own_x, inner - own_y, c, s, scale, size)
+        _bar(view, cover, x, y, -s, c, 0.0, short, width, WALL_GREY)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _blend(value, grey, share):  # type: ignore[no-untyped-def]
+    """A pixel after a shape covered a share of it."""
+    return np.uint8(value + (grey - np.float64(value)) * share + 0.5)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _box(view, x0, x1, y0, y1, grey):  # type: ignore[no-untyped-def]
+    """Paints the upright rectangle [x0, x1] x [y0, y1]."""
+    size = view.shape[0]
+    if not (x1 > 0 and x0 < size and y1 > 0 and y0 < size and x1 - x0 < 1e9):
+        return
+    x0, x1 = max(x0, 0.0), min(x1, np.float64(size))
+    y0, y1 = max(y0, 0.0), min(y1, np.float64(size))
+    for i in range(int(y0), math.ceil(y1)):
+        tall = min(i + 1.0, y1) - max(np.float64(i), y0)
+        for j in range(int(x0), math.ceil(x1)):
+            wide = min(j + 1.0, x1) - max(np.float64(j), x0)
+            view[i, j] = _blend(view[i, j], grey, tall * wide)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _add_span(cover, low, high, weight):  # type: ignore[no-untyped-def]
+    """Adds to each pixel of a line weight x its part of [low, high], within [0, V]."""
+    first, last = int(low), int(high)
+    if first == last:
+        cover[first] += weight * (high - low)
+        return
+    cover[first] += weight * (first + 1 - low)
+    for i in range(first + 1, last):
+        cover[i] += weight
+    cover[last] += weight * (high - last)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _disc(view, cover, x, y, radius, lines):  # type: ignore[no-untyped-def]
+    """Paints a robot's disc: exact along x, `lines` scan lines a pixel along y."""
+    size = view.shape[0]
+    if not (x + radius > 0 and x - radius < size and y + radius > 0 and y - radius < size):
+        return
+    first, last = int(max(x - radius, 0.0)), math.ceil(min(x + radius, np.float64(size)))
+    for i in range(int(max(y - radius, 0.0)), math.ceil(min(y + radius, np.float64(size)))):
+        top = max(np.float64(i), y - radius) - y
+        weight = (min(i + 1.0, y + radius) - y - top) / lines
+        for k in range(lines):
+            dy = top + (k + 0.5) * weight
+            square = radius * radius - dy * dy
+            if square > 0:
+                chord = math.sqrt(square)
+                low, high = max(x - chord, 0.0), min(x + chord, np.float64(size))
+                if low < high:
+                    _add_span(cover, low, high, weight)
+        for j in range(first, last):
+            view[i, j] = _blend(view[i, j], ROBOT_GREY, min(cover[j], 1.0))
+            cover[j] = 0.0
+        cover[size] = 0.0
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _bar(view, cover, x, y, dx, dy, start, end, half, grey):  # type: ignore[no-untyped-def]
+    """Paints the rectangle from start to end along (dx, dy) from (x, y), half to either side.
+
+    Scan lines cross it the short way, where its extent is exact.
+    """
+    if abs(dx) >= abs(dy):
+        _bar_across(view.T, cover, y, x, dy, dx, start, end, half, grey)
+    else:
+        _bar_across(view, cover, x, y, dx, dy, start, end, half, grey)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _bar_across(view, cover, x, y, dx, dy, start, end, half, grey):  # type: ignore[no-untyped-def]
+    """_bar with scan lines along the view's rows, for |dy| >= |dx|."""
+    size = view.shape[0]
+    low_y = y + min(start * dy, end * dy) - half * abs(dx)
+    high_y = y + max(start * dy, end * dy) + half * abs(dx)
+    low_x = x + min(start * dx, end * dx) - half * abs(dy)
+    high_x = x + max(start * dx, end * dx) + half * abs(dy)
+    if not (high_x > 0 and low_x < size and high_y > 0 and low_y < size):
+        return
+    width = half / abs(dy)
+    for i in range(int(max(low_y, 0.0)), math.ceil(min(high_y, np.float64(size)))):
+        first, last = size, 0
+        top = max(np.float64(i), low_y) - y
+        weight = (min(i + 1.0, high_y) - y - top) / _BAR_LINES
+        for k in range(_BAR_LINES):
+            t = top + (k + 0.5) * weight
+            middle = x + t * dx / dy
+            low, high = max(middle - width, 0.0), min(middle + width, np.float64(size))
+            if abs(dx) > 1e-9:
+                one, other = x + (start - t * dy) / dx, x + (end - t * dy) / dx
+                low, high = max(low, min(one, other)), min(high, max(one, other))
+            elif not start <= t * dy <= end:
+                continue
+            if low < high:
+                _add_span(cover, low, high, weight)
+                first, last = min(first, int(low)), max(last, math.ceil(high))
+        for j in range(first, last):
+            view[i, j] = _blend(view[i, j], grey, min(cover[j], 1.0))
+            cover[j] = 0.0
+        cover[size] = 0.0

@@ -1,0 +1,68 @@
+"""Command-line flags made from the configuration's schema; an unknown one gets the nearest name.
+
+Invariants: `--section.field VALUE` exists for every field, with its description; values are
+checked by the schema, not here.
+"""
+
+import argparse
+import difflib
+import re
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from common.config import sections
+
+_DEST = "config:"
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser that takes no abbreviations and suggests the nearest flag."""
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        kwargs.setdefault("allow_abbrev", False)
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            self._refuse(unknown[0])
+        return parsed
+
+    def _refuse(self, argument: str) -> NoReturn:
+        name = argument.split("=")[0]
+        known = [option for action in self._actions for option in action.option_strings]
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        self.error(f"unknown argument {name}" + (f"; did you mean {near[0]}?" if near else ""))
+
+    def error(self, message: str) -> NoReturn:
+        """One line, exit code 2."""
+        sys.stderr.write(f"mrcdrl: {message} (see {self.prog} --help)\n")
+        raise SystemExit(2)
+
+
+def add_config_flags(parser: argparse.ArgumentParser) -> None:
+    """A flag for every field of the configuration."""
+    for section, model in sections().items():
+        group = parser.add_argument_group(f"[{section}]")
+        for name, info in model.model_fields.items():
+            text = re.sub(r"\s+", " ", info.description or "").replace("%", "%%")
+            default = re.sub(r"\s+", "", str(info.default)).replace("%", "%%")
+            group.add_argument(
+                f"--{section}.{name}",
+                dest=f"{_DEST}{section}.{name}",
+                metavar="X",
+                help=f"{text} Default: {default}",
+            )
+
+
+def overrides(namespace: argparse.Namespace) -> dict[str, str]:
+    """The configuration flags that were given: "section.field" to text."""
+    return {
+        key.removeprefix(_DEST): value
+        for key, value in vars(namespace).items()
+        if key.startswith(_DEST) and value is not None
+    }

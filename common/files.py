@@ -1,0 +1,95 @@
+"""Files that are there wholly or not at all, and the weights kept in them.
+
+Invariants: a name is given to a file only when its bytes are on the disk; what a failed or
+killed write leaves behind never bears the final name; no torch here.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from common.errors import CheckpointError
+
+TEMPORARY_SUFFIX = ".part"
+
+
+def write_synced(path: Path, content: bytes) -> None:
+    """Write a new file and wait until it is on the disk; raises OSError."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        remaining = memoryview(content)
+        while remaining:
+            remaining = remaining[os.write(descriptor, remaining) :]
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_directory(path: Path) -> None:
+    """Wait until the names in a directory are on the disk; raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def atomic_write(path: Path, content: bytes) -> None:
+    """Write or replace a file in one step; on OSError the old one is as it was.
+
+    Two writers at once are safe, the last wins.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    try:
+        write_synced(temporary, content)
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_directory(path.parent)
+
+
+def sha256(content: bytes) -> str:
+    """Hexadecimal digest."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def write_weights(path: Path, payload: bytes, manifest: Mapping[str, Any]) -> None:
+    """Keep published weights: `path` the payload, and beside it `.json` what is known of them.
+
+    Raises CheckpointError if the disk is full or the folder cannot be written.
+    """
+    described = {**manifest, "sha256": sha256(payload)}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, payload)
+        text = json.dumps(described, indent=2, allow_nan=False)
+        atomic_write(path.with_suffix(".json"), text.encode())
+    except OSError as error:
+        raise CheckpointError(f"weights {path} not written: {reason(error)}") from error
+
+
+def read_weights(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """The payload and what is known of it: {} if the file beside it is not about this payload.
+
+    Raises CheckpointError if the payload cannot be read; whether it is whole, its reader sees.
+    """
+    try:
+        payload = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"weights {path}: {reason(error)}") from error
+    try:
+        manifest = json.loads(path.with_suffix(".json").read_bytes())
+    except (OSError, ValueError):
+        return payload, {}
+    if not isinstance(manifest, dict) or manifest.get("sha256") != sha256(payload):
+        return payload, {}
+    return payload, manifest
+
+
+def reason(error: OSError) -> str:
+    """Why, in a few words, such as "No space left on device"."""
+    return error.strerror or type(error).__name__

@@ -1,0 +1,83 @@
+"""Every Zenoh key expression of a run; literals stand here only.
+
+mrcdrl/<run>/replay/<shard>/insert     query: Chunk -> InsertReply
+mrcdrl/<run>/replay/<shard>/sample     query: SampleRequest -> Samples
+mrcdrl/<run>/weights                   publication and query: Weights
+mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
+mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
+mrcdrl/<run>/stats/<role>/<worker>       publication: Stats
+mrcdrl/<run>/live/<role>/<worker>        liveliness token
+"""
+
+import re
+from dataclasses import dataclass
+
+from common.errors import ConfigError
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+def check_name(name: str, what: str) -> str:
+    """`name`, or ConfigError where it would not stand in a key expression and a file name."""
+    if not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"{what} {name!r}: up to 64 letters, digits, '.', '_' and '-', a letter or digit first"
+        )
+    return name
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The key expressions of one run."""
+
+    run: str
+
+    def __post_init__(self) -> None:
+        check_name(self.run, "run name")
+
+    def insert(self, shard: int = 0) -> str:
+        return f"mrcdrl/{self.run}/replay/{shard}/insert"
+
+    def sample(self, shard: int = 0) -> str:
+        return f"mrcdrl/{self.run}/replay/{shard}/sample"
+
+    @property
+    def config(self) -> str:
+        return f"mrcdrl/{self.run}/config"
+
+    @property
+    def weights(self) -> str:
+        return f"mrcdrl/{self.run}/weights"
+
+    def evaluation(self, worker: str) -> str:
+        return f"mrcdrl/{self.run}/evaluation/{worker}"
+
+    def episodes(self, actor: str) -> str:
+        return f"mrcdrl/{self.run}/episodes/{actor}"
+
+    def stats(self, role: str, worker: str) -> str:
+        return f"mrcdrl/{self.run}/stats/{role}/{worker}"
+
+    def live(self, role: str, worker: str) -> str:
+        return f"mrcdrl/{self.run}/live/{role}/{worker}"
+
+    @property
+    def every_evaluation(self) -> str:
+        return self.evaluation("*")
+
+    @property
+    def every_episode(self) -> str:
+        return self.episodes("*")
+
+    @property
+    def every_stats(self) -> str:
+        return self.stats("*", "*")
+
+    def everyone(self, role: str = "*") -> str:
+        return self.live(role, "*")
+
+
+def role_and_worker(live_key: str) -> tuple[str, str]:
+    """The role and worker in a liveliness token's key."""
+    role, worker = live_key.split("/")[-2:]
+    return role, worker

@@ -1,0 +1,166 @@
+"""What every service's shell shares: signals, logging, joining a run, and a clean exit.
+
+Invariants: SIGTERM and SIGINT set one StopSignal; errors on purpose end the process with one
+line and exit code 1; bugs of ours crash with a traceback.
+"""
+
+import logging
+import os
+import re
+import signal
+import socket
+import sys
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from common.arguments import Parser, add_config_flags, overrides
+from common.config import Config, TransportConfig, apply_overrides, load_config, validate_config
+from common.errors import DeadlineError, EndpointError, MrcdrlError, TransportError
+from common.keys import Keys, check_name
+from common.trajectory import Stats
+from common.transport import Publisher, Session
+from common.wire import encode
+
+ENDPOINT_FILE = "endpoint"
+_LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+
+
+class StopSignal:
+    """Set once, by a signal or from within; many may wait for it."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+
+    def listen(self) -> "StopSignal":
+        """Have SIGTERM and SIGINT set it; call from the main thread."""
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGINT, self._on_signal)
+        return self
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        self._event.set()
+
+    def set(self) -> None:
+        self._event.set()
+
+    def is_set(self) -> bool:
+        return self._event.is_set()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it is set within the time."""
+        return self._event.wait(timeout_s)
+
+
+def run_main(main: Callable[[], int | None]) -> int:
+    """Run a command; the exit code. MrcdrlError becomes one line on stderr."""
+    logging.basicConfig(level=logging.INFO, format=_LOG_FORMAT, stream=sys.stderr)
+    try:
+        return main() or 0
+    except MrcdrlError as error:
+        sys.stderr.write(f"mrcdrl: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("mrcdrl: interrupted\n")
+        return 130
+
+
+@dataclass(frozen=True, slots=True)
+class Joining:
+    """How a service finds its run."""
+
+    run: str
+    worker: str
+    run_dir: Path  # of this run
+    transport: TransportConfig
+    overrides: dict[str, str]
+
+    @property
+    def keys(self) -> Keys:
+        return Keys(self.run)
+
+
+def joining_arguments(role: str, argv: Sequence[str]) -> Joining:
+    """A service's command line.
+
+    Raises EndpointError where neither --connect nor the run's folder names an endpoint.
+    """
+    parser = Parser(prog=f"mrcdrl {role}", description=f"Start the {role} of a run that is up.")
+    parser.add_argument("--run", required=True, help="the run's name")
+    parser.add_argument("--connect", action="append", help="endpoint, such as tcp/HOST:7447")
+    parser.add_argument("--id", help="this worker's name; by default from the host and process")
+    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
+    add_config_flags(parser)
+    arguments = parser.parse_args(argv)
+    run_dir = arguments.run_dir / check_name(arguments.run, "run name")
+    worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", f"{socket.gethostname()}-{os.getpid()}")
+    given = overrides(arguments)
+    transport = load_config(
+        None, {k: v for k, v in given.items() if k.startswith("transport.")}
+    ).transport
+    if arguments.connect or not transport.connect:
+        endpoints = tuple(arguments.connect or [_noted_endpoint(run_dir)])
+        transport = transport.model_copy(update={"connect": endpoints})
+    return Joining(arguments.run, check_name(worker, "--id"), run_dir, transport, given)
+
+
+def _noted_endpoint(run_dir: Path) -> str:
+    """Where the run on this machine listens, as `mrcdrl train` wrote it down."""
+    try:
+        return (run_dir / ENDPOINT_FILE).read_text("utf-8").strip()
+    except OSError as error:
+        raise EndpointError(
+            f"no run is up in {run_dir}; give --connect, such as tcp/127.0.0.1:7447"
+        ) from error
+
+
+def fetch_config(session: Session, joining: Joining, stop: StopSignal) -> Config:
+    """The run's configuration, from its replay service, under this process's own flags.
+
+    Raises DeadlineError where nobody serves that run for 30 s.
+    """
+    whom = f"the replay service of run {joining.run!r}"
+    client = session.client(joining.keys.config, whom, timeout_s=2.0)
+    deadline = time.monotonic() + 30.0
+    while True:
+        try:
+            text = client.ask(b"").result().decode()
+        except DeadlineError as error:
+            if time.monotonic() > deadline or stop.wait(0.2):
+                raise DeadlineError(f"{error}; is that the run's name?") from error
+            continue
+        table = {**tomllib.loads(text), "transport": joining.transport.model_dump()}
+        return apply_overrides(validate_config(table), joining.overrides)
+
+
+def available_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class StatsReporter:
+    """Publishes a service's metrics once a second, from its own main loop."""
+
+    def __init__(self, publisher: Publisher, role: str, worker: str) -> None:
+        self._publisher = publisher
+        self._role = role
+        self._worker = worker
+        self._due_s = 0.0
+
+    def maybe(self, metrics: Callable[[], dict[str, float]]) -> None:
+        """Publish if a second has passed since the last time."""
+        if time.monotonic() >= self._due_s:
+            self.now(metrics)
+
+    def now(self, metrics: Callable[[], dict[str, float]]) -> None:
+        """Publish, and again in a second."""
+        self._due_s = time.monotonic() + 1.0
+        try:
+            numbers = {name: float(value) for name, value in metrics().items()}
+            self._publisher.put(encode(Stats(self._role, self._worker, numbers)))
+        except TransportError as error:
+            logging.getLogger(self._role).warning("stats not published: %s", error)

@@ -1,0 +1,222 @@
+"""Messages to bytes and back, both pure; docs/wire.md describes the same for other languages.
+
+A message is one msgpack map: its fields by name, and `schema`, the message's name and version.
+A number array is a pair [shape, bytes], C order, little-endian, of the dtype that
+`common/trajectory.py` declares. Invariants: what `decode` returns has exactly the declared
+types, dtypes and mutually fitting shapes; any other bytes raise WireError with the reason.
+"""
+
+import enum
+import math
+import types
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgpack
+import numpy as np
+
+from common.errors import WireError
+from common.trajectory import (
+    Chunk,
+    EpisodeSummary,
+    Evaluation,
+    InsertReply,
+    Samples,
+    Stats,
+    Weights,
+)
+
+M = TypeVar("M")
+_MAX_NDIM = 8
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRequest:
+    """A learner's wish for one mini-batch."""
+
+    batch_size: int
+
+
+def _check_chunk(chunk: Chunk) -> str | None:
+    length = len(chunk.actions)
+    arrays = (chunk.rewards, chunk.discounts, chunk.bootstrap_offsets)
+    if any(a.ndim != 1 for a in (chunk.actions, *arrays, chunk.priorities)):
+        return "actions, rewards, discounts, bootstrap_offsets and priorities are vectors"
+    if length == 0 or any(len(a) != length for a in arrays):
+        return "actions, rewards, discounts and bootstrap_offsets differ in length, or are empty"
+    if len(chunk.priorities) not in (0, length):
+        return "priorities has neither no entry nor one a transition"
+    if chunk.records.ndim != 2 or chunk.records.shape[0] <= length:
+        return "records is no matrix with more rows than there are transitions"
+    if not (np.isfinite(chunk.rewards).all() and np.isfinite(chunk.discounts).all()):
+        return "a reward or discount is not finite"
+    if not (np.isfinite(chunk.priorities).all() and (chunk.priorities >= 0).all()):
+        return "a priority is negative or not finite"
+    if chunk.bootstrap_offsets.min() < 1:
+        return "a bootstrap offset is 0"
+    if chunk.sequence < 0 or chunk.weights_version < 0:
+        return "sequence or weights_version is negative"
+    return None
+
+
+def _check_samples(samples: Samples) -> str | None:
+    size = len(samples.actions)
+    if samples.records.ndim != 3:
+        return "records is no array of 3 dimensions"
+    vectors = (
+        samples.keys,
+        samples.probabilities,
+        samples.actions,
+        samples.rewards,
+        samples.discounts,
+        samples.bootstrap_offsets,
+        samples.weights_versions,
+    )
+    if any(v.ndim != 1 or len(v) != size for v in vectors) or len(samples.records) != size:
+        return "arrays differ in length"
+    return None
+
+
+_SCHEMAS: dict[type, str] = {
+    Chunk: "chunk/1",
+    InsertReply: "insert_reply/1",
+    SampleRequest: "sample_request/1",
+    Samples: "samples/1",
+    Weights: "weights/1",
+    EpisodeSummary: "episode/1",
+    Evaluation: "evaluation/1",
+    Stats: "stats/1",
+}
+_CHECKS: dict[type, Callable[[Any], str | None]] = {Chunk: _check_chunk, Samples: _check_samples}
+
+
+def encode(message: Any) -> bytes:
+    """The bytes of any message of the schema."""
+    table: dict[str, Any] = {"schema": _SCHEMAS[type(message)]}
+    for field in fields(message):
+        value = getattr(message, field.name)
+        if isinstance(value, np.ndarray):
+            little = value.astype(value.dtype.newbyteorder("<"), copy=False)
+            value = [list(value.shape), little.tobytes()]
+        table[field.name] = value
+    packed: bytes = msgpack.packb(table)
+    return packed
+
+
+def decode(cls: type[M], data: bytes) -> M:
+    """The message of class `cls` that `data` holds; its arrays are read-only views of `data`.
+
+    Raises WireError, with the reason, for whatever `encode` would not have written.
+    """
+    try:
+        table = msgpack.unpackb(data, raw=False, strict_map_key=True, use_list=True)
+    except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
+        raise WireError(f"no msgpack: {type(error).__name__}") from error
+    if not isinstance(table, dict):
+        raise WireError("not a map")
+    schema = table.pop("schema", None)
+    if schema != _SCHEMAS[cls]:
+        raise WireError(f"schema {str(schema)[:40]!r} where {_SCHEMAS[cls]!r} is due")
+    readers = _READERS[cls]
+    if table.keys() != readers.keys():
+        odd = sorted(map(str, table.keys() ^ readers.keys()))
+        raise WireError(f"missing or unknown fields: {', '.join(odd)[:120]}")
+    values = {}
+    for name, read in readers.items():
+        try:
+            values[name] = read(table[name])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise WireError(f"{name}: {error}") from error
+    message = cls(**values)
+    check = _CHECKS.get(cls)
+    if check is not None and (reason := check(message)) is not None:
+        raise WireError(reason)
+    return message
+
+
+def _readers_of(cls: type) -> dict[str, Callable[[Any], Any]]:
+    hints = get_type_hints(cls)
+    return {field.name: _reader(hints[field.name]) for field in fields(cls)}
+
+
+def _reader(hint: Any) -> Callable[[Any], Any]:
+    """A function from the unpacked value to the declared type; raises TypeError or ValueError."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is np.ndarray:
+        return _array_reader(np.dtype(get_args(args[1])[0]))
+    if origin in (Union, types.UnionType):
+        inner = _reader(next(a for a in args if a is not type(None)))
+        return lambda value: None if value is None else inner(value)
+    if origin is tuple:
+        return _tuple_reader([_reader(a) for a in args])
+    if origin is dict:
+        return _dict_reader(_reader(args[1]))
+    if isinstance(hint, type) and issubclass(hint, enum.StrEnum):
+        return hint
+    if hint is float:
+        return _read_float
+    if hint is int:
+        return _read_int
+    return _exact(hint)
+
+
+def _array_reader(dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if not (isinstance(value, list) and len(value) == 2):
+            raise TypeError("no pair [shape, bytes]")
+        shape, data = value
+        if not isinstance(data, bytes) or not isinstance(shape, list) or len(shape) > _MAX_NDIM:
+            raise TypeError("no pair [shape, bytes]")
+        if any(type(n) is not int or n < 0 for n in shape):
+            raise ValueError("a length in the shape is no natural number")
+        if math.prod(shape) * dtype.itemsize != len(data):
+            raise ValueError(f"shape {shape} of {dtype} does not fit {len(data)} bytes")
+        little = np.frombuffer(data, dtype.newbyteorder("<")).reshape(shape)
+        return little.astype(dtype, copy=False)
+
+    return read
+
+
+def _tuple_reader(readers: list[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if not isinstance(value, list) or len(value) != len(readers):
+            raise TypeError(f"no list of {len(readers)}")
+        return tuple(r(v) for r, v in zip(readers, value, strict=True))
+
+    return read
+
+
+def _dict_reader(reader: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict) or any(type(k) is not str for k in value):
+            raise TypeError("no map with names")
+        return {k: reader(v) for k, v in value.items()}
+
+    return read
+
+
+def _read_float(value: Any) -> float:
+    if type(value) not in (float, int):
+        raise TypeError("no number")
+    return float(value)
+
+
+def _read_int(value: Any) -> int:
+    if type(value) is not int:
+        raise TypeError("no integer")
+    if not -(2**63) <= value < 2**63:
+        raise ValueError("integer outside 64 bits")
+    return value
+
+
+def _exact(expected: type) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if type(value) is not expected:
+            raise TypeError(f"no {expected.__name__}")
+        return value
+
+    return read
+
+
+_READERS = {cls: _readers_of(cls) for cls in _SCHEMAS}

@@ -1,0 +1,156 @@
+"""`mrcdrl actor`: join a run, follow its weights, collect, until told to stop."""
+
+import logging
+import sys
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from common.arena import make_arena, make_codec
+from common.config import Config
+from common.exploration import epsilons
+from common.policy import Policy, make_policy
+from common.process import (
+    Joining,
+    StatsReporter,
+    StopSignal,
+    fetch_config,
+    joining_arguments,
+    run_main,
+)
+from common.trajectory import Float32Array
+from common.transport import Session
+from common.weights import WeightsReader
+from common.wire import encode
+from services.actor.chunker import Origin
+from services.actor.collector import Collector
+from services.actor.sender import Sender
+from services.replay.client import ReplayWriter
+
+_LOG = logging.getLogger("actor")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Collect for a run; the exit code."""
+    joining = joining_arguments("actor", argv)
+    stop = StopSignal().listen()
+    with Session(joining.transport) as session, Session(joining.transport) as bulk:
+        config = fetch_config(session, joining, stop)
+        torch.set_num_threads(config.actor.threads)
+        session.announce(joining.keys.live("actor", joining.worker))
+        writer = ReplayWriter(bulk, joining.keys, config.actor.warn_s, stop)
+        sender = Sender(writer, config.actor.spool_chunks)
+        try:
+            Actor(config, joining, session, sender).run(stop)
+        finally:
+            sender.close()
+    return 0
+
+
+class Actor:
+    """The shell around a collector."""
+
+    def __init__(self, config: Config, joining: Joining, session: Session, sender: Sender) -> None:
+        keys, worker = joining.keys, joining.worker
+        self._config = config
+        self._sender = sender
+        self._reader = WeightsReader(session, keys)
+        self._peers = session.presence(keys.everyone("actor"))
+        self._live_key = keys.live("actor", worker)
+        self._episodes = session.publisher(keys.episodes(worker))
+        self._reporter = StatsReporter(
+            session.publisher(keys.stats("actor", worker)), "actor", worker
+        )
+        self._policy = make_policy(config)
+        self._collector = make_collector(config, worker, self._policy)
+        self._adopted_s = time.monotonic()
+        self._epsilons = self._explore()
+        self._waited_s = 0.0
+        self._started_s = time.monotonic()
+
+    def run(self, stop: StopSignal) -> None:
+        """Follow, step, send, tell, until stopped."""
+        first = self._reader.wait(stop)
+        if first is not None:
+            self._policy.adopt(first)
+        while not stop.is_set():
+            self._follow()
+            chunks, episodes = self._collector.step(self._epsilons)
+            for chunk in chunks:
+                waiting_s = time.monotonic()
+                while not self._sender.put(chunk, timeout_s=0.2) and not stop.is_set():
+                    self._reporter.maybe(self._metrics)
+                self._waited_s += time.monotonic() - waiting_s
+            for episode in episodes:
+                self._episodes.put(encode(episode))
+            self._reporter.maybe(self._metrics)
+
+    def _follow(self) -> None:
+        """Adopt newer weights, and explore as their step and the number of actors say."""
+        weights = self._reader.latest()
+        if weights is not None:
+            self._policy.adopt(weights)
+            self._adopted_s = time.monotonic()
+        if weights is not None or any(True for _ in self._peers.changes()):
+            self._epsilons = self._explore()
+
+    def _explore(self) -> Float32Array:
+        """Epsilon of each arena; an actor's rank is its place among the names of those alive."""
+        names = sorted(self._peers.alive() | {self._live_key})
+        return epsilons(
+            self._config.exploration,
+            self._policy.learner_step,
+            names.index(self._live_key),
+            len(names),
+            self._config.actor.num_arenas,
+        )
+
+    def _metrics(self) -> dict[str, float]:
+        collector, seconds = self._collector, self._collector.seconds
+        now = time.monotonic()
+        lived_s = max(now - self._started_s, 1e-9)
+        return {
+            "env_steps": collector.env_steps,
+            "robot_steps": collector.robot_steps,
+            "episodes": collector.num_episodes,
+            "chunks": self._sender.chunks,
+            "inserts_acknowledged": self._sender.transitions,
+            "spool_chunks": self._sender.spooled,
+            "weights_version": self._policy.weights_version,
+            "weights_age_s": now - self._adopted_s,
+            "weights_refused": self._reader.refused,
+            "epsilon_min": float(self._epsilons.min()),
+            "epsilon_max": float(self._epsilons.max()),
+            "inference_share": seconds.inference / lived_s,
+            "arena_share": seconds.arena / lived_s,
+            "draw_share": seconds.draw / lived_s,
+            "chunk_share": seconds.chunk / lived_s,
+            "wait_share": self._waited_s / lived_s,
+        }
+
+
+def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
+    """Arenas, codec and chunkers for one actor; its seeds differ by its name."""
+    name_entropy = int.from_bytes(worker.encode(), "little")
+    seeds = np.random.SeedSequence([config.run.seed, name_entropy])
+    *arena_seeds, policy_seed = seeds.spawn(config.actor.num_arenas + 1)
+    arenas = [
+        make_arena(config.arena, np.random.default_rng(seed), identity=index)
+        for index, seed in enumerate(arena_seeds)
+    ]
+    origin = Origin(
+        actor=worker,
+        incarnation=time.time_ns(),
+        gamma=config.agent.gamma,
+        n_step=config.agent.n_step,
+        stack=config.arena.stack,
+        chunk_length=config.actor.chunk_length,
+    )
+    codec = make_codec(config.arena)
+    return Collector(config, origin, arenas, codec, policy, np.random.default_rng(policy_seed))
+
+
+if __name__ == "__main__":
+    sys.exit(run_main(lambda: main(sys.argv[1:])))

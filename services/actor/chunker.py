@@ -1,0 +1,121 @@
+"""From one robot's steps to chunks that stand alone: history before, n-step returns, bootstrap.
+
+Invariants: every step becomes exactly one transition, in order, in exactly one chunk; n-step
+returns are summed here and nowhere else; pure.
+
+    R_t = sum_{i<k} gamma^i r_{t+i},   discount_t = gamma^k, or 0 if the episode terminated there,
+    k = min(n, steps left in the episode)
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.trajectory import Chunk, Float32Array, UInt8Array
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Who makes the chunks, and how they are cut."""
+
+    actor: str
+    incarnation: int
+    gamma: float
+    n_step: int
+    stack: int
+    chunk_length: int
+
+
+class Chunker:
+    """The stream of one robot; `start` at each episode, `add` at each step."""
+
+    def __init__(self, origin: Origin) -> None:
+        self._origin = origin
+        self._history = origin.stack - 1
+        self._records: list[UInt8Array] = []
+        self._actions: list[int] = []
+        self._rewards: list[float] = []
+        self._versions: list[int] = []
+
+    def start(self, record: UInt8Array) -> None:
+        """Begin an episode with its first record, uint8 [R], repeated to fill the first state."""
+        self._records = [record] * self._origin.stack
+        self._actions, self._rewards, self._versions = [], [], []
+
+    def add(
+        self,
+        action: int,
+        reward: float,
+        record: UInt8Array,
+        *,
+        weights_version: int,
+        last: bool,
+        discount: float,
+        sequence: Iterator[int],
+    ) -> list[Chunk]:
+        """One step: the action, its reward and the record after it; the chunks now complete.
+
+        discount: of the step, 0 where the episode terminated. sequence: the actor's next numbers.
+        """
+        self._records.append(record)
+        self._actions.append(action)
+        self._rewards.append(reward)
+        self._versions.append(weights_version)
+        if last:
+            return self._finish(discount, sequence)
+        length, n = self._origin.chunk_length, self._origin.n_step
+        if len(self._actions) < length + n - 1:
+            return []
+        return [self._cut(length, discount=1.0, sequence=sequence)]
+
+    def _finish(self, discount: float, sequence: Iterator[int]) -> list[Chunk]:
+        """All steps left of an episode that ended; its last record is repeated as a tail."""
+        self._records += [self._records[-1]] * (self._origin.n_step - 1)
+        chunks = []
+        while self._actions:
+            length = min(self._origin.chunk_length, len(self._actions))
+            chunks.append(self._cut(length, discount=discount, sequence=sequence))
+        return chunks
+
+    def _cut(self, length: int, *, discount: float, sequence: Iterator[int]) -> Chunk:
+        """The first `length` steps as a chunk; what later steps need of them stays."""
+        origin = self._origin
+        rewards, discounts, offsets = self._returns(length, discount)
+        chunk = Chunk(
+            actor=origin.actor,
+            incarnation=origin.incarnation,
+            sequence=next(sequence),
+            weights_version=min(self._versions[:length]),
+            records=np.stack(self._records[: self._history + length + origin.n_step]),
+            actions=np.array(self._actions[:length], np.uint8),
+            rewards=rewards,
+            discounts=discounts,
+            bootstrap_offsets=offsets,
+            priorities=np.empty(0, np.float32),
+        )
+        for column in (self._records, self._actions, self._rewards, self._versions):
+            del column[:length]
+        return chunk
+
+    def _returns(
+        self, length: int, discount: float
+    ) -> tuple[Float32Array, Float32Array, UInt8Array]:
+        """n-step returns, discounts and offsets of the first `length` steps.
+
+        discount: of the episode's end, where a return reaches it.
+        """
+        gamma, n = self._origin.gamma, self._origin.n_step
+        steps = np.arange(length)
+        offsets = np.minimum(n, len(self._actions) - steps)
+        rewards = np.zeros(length + n, np.float64)
+        known = self._rewards[: length + n]
+        rewards[: len(known)] = known
+        sums = sum(gamma**i * rewards[i : i + length] * (i < offsets) for i in range(n))
+        at_end = steps + offsets == len(self._actions)
+        discounts = gamma**offsets * np.where(at_end, discount, 1.0)
+        return (
+            np.asarray(sums, np.float32),
+            discounts.astype(np.float32),
+            offsets.astype(np.uint8),
+        )

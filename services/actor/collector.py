@@ -1,0 +1,151 @@
+"""Many arenas stepped together: one batched inference for all of their robots.
+
+Invariants: the policy sees pictures drawn from the very records that go to replay; no thread,
+clock for decisions, or transport; each arena's exploration is its own.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from common.arena import Arena, CountingArena, ObservationCodec
+from common.config import Config
+from common.policy import FrameStack, Policy
+from common.trajectory import Chunk, EpisodeSummary, Float32Array, TimeStep, UInt8Array
+from services.actor.chunker import Chunker, Origin
+
+
+@dataclass(slots=True)
+class Seconds:
+    """Where a collector's time went, since the start."""
+
+    inference: float = 0.0
+    arena: float = 0.0
+    draw: float = 0.0
+    chunk: float = 0.0
+
+
+@dataclass(slots=True)
+class _Episode:
+    """What is counted of an episode under way."""
+
+    number: int
+    rewards: float = 0.0
+    greedy_q: float = 0.0
+    frames: int = 0
+    collisions: int = 0
+    versions: list[int] = field(default_factory=list)
+
+
+class Collector:
+    """Steps arenas by a policy; `step` returns the chunks and episodes that are complete."""
+
+    def __init__(
+        self,
+        config: Config,
+        origin: Origin,
+        arenas: Sequence[Arena | CountingArena],
+        codec: ObservationCodec,
+        policy: Policy,
+        rng: np.random.Generator,
+    ) -> None:
+        self._origin = origin
+        self._arenas = arenas
+        self._codec = codec
+        self._policy = policy
+        self._rng = rng
+        self._num_robots = config.arena.num_robots
+        num_states = len(arenas) * self._num_robots
+        self._chunkers = [[Chunker(origin) for _ in range(self._num_robots)] for _ in arenas]
+        self._frames = FrameStack(num_states, config.arena.stack, config.arena.view_px)
+        self._sequence: Iterator[int] = iter(range(2**62))
+        self._episodes = [_Episode(0) for _ in arenas]
+        self.seconds = Seconds()
+        self.env_steps = 0
+        self.num_episodes = 0
+        self._reset(range(len(arenas)))
+
+    @property
+    def robot_steps(self) -> int:
+        """Transitions made."""
+        return self.env_steps * self._num_robots
+
+    def step(self, epsilons: Float32Array) -> tuple[list[Chunk], list[EpisodeSummary]]:
+        """One step of every arena, arena e exploring with epsilons[e]."""
+        started = time.perf_counter()
+        per_robot = np.repeat(epsilons, self._num_robots)
+        selection = self._policy.select_actions(self._frames.stacks, per_robot, self._rng)
+        inferred = time.perf_counter()
+        shape = (len(self._arenas), self._num_robots)
+        actions = selection.actions.reshape(shape)
+        time_steps = [arena.step(a) for arena, a in zip(self._arenas, actions, strict=True)]
+        stepped = time.perf_counter()
+        chunks = [
+            chunk
+            for index, time_step in enumerate(time_steps)
+            for chunk in self._add(index, actions[index], time_step)
+        ]
+        greedy_q = selection.greedy_q.reshape(shape).mean(axis=1)
+        for episode, time_step, q in zip(self._episodes, time_steps, greedy_q, strict=True):
+            episode.frames += 1
+            episode.rewards += float(time_step.rewards.mean())
+            episode.collisions += int(time_step.collided.sum())
+            episode.greedy_q += float(q)
+            episode.versions.append(self._policy.weights_version)
+        ended = [index for index, time_step in enumerate(time_steps) if time_step.last]
+        summaries = [self._summary(i, time_steps[i], float(epsilons[i])) for i in ended]
+        chunked = time.perf_counter()
+        self._draw([time_step.records for time_step in time_steps])
+        self._reset(ended)
+        self.env_steps += len(self._arenas)
+        self.seconds.inference += inferred - started
+        self.seconds.arena += stepped - inferred
+        self.seconds.chunk += chunked - stepped
+        self.seconds.draw += time.perf_counter() - chunked
+        return chunks, summaries
+
+    def _add(self, index: int, actions: UInt8Array, time_step: TimeStep) -> Iterator[Chunk]:
+        for robot, chunker in enumerate(self._chunkers[index]):
+            yield from chunker.add(
+                int(actions[robot]),
+                float(time_step.rewards[robot]),
+                time_step.records[robot],
+                weights_version=max(self._policy.weights_version, 0),
+                last=time_step.last,
+                discount=time_step.discount,
+                sequence=self._sequence,
+            )
+
+    def _draw(self, records: list[UInt8Array]) -> None:
+        self._frames.push(self._codec.decode(np.concatenate(records)))
+
+    def _reset(self, indices: Sequence[int]) -> None:
+        """Start new episodes in these arenas."""
+        for index in indices:
+            time_step = self._arenas[index].reset()
+            for chunker, record in zip(self._chunkers[index], time_step.records, strict=True):
+                chunker.start(record)
+            first = index * self._num_robots
+            states = slice(first, first + self._num_robots)
+            self._frames.reset(states, self._codec.decode(time_step.records))
+
+    def _summary(self, index: int, time_step: TimeStep, epsilon: float) -> EpisodeSummary:
+        episode = self._episodes[index]
+        if time_step.outcome is None:
+            raise ValueError("an arena ended an episode without an outcome")
+        self._episodes[index] = _Episode(self.num_episodes + 1)
+        self.num_episodes += 1
+        return EpisodeSummary(
+            actor=self._origin.actor,
+            arena=index,
+            episode=self.num_episodes,
+            outcome=time_step.outcome,
+            frames=episode.frames,
+            score=episode.rewards,
+            collisions=episode.collisions,
+            epsilon=epsilon,
+            weights_version=max(min(episode.versions), 0),
+            mean_q=episode.greedy_q / episode.frames,
+        )

@@ -1,0 +1,69 @@
+"""A bounded spool between the arenas and replay, emptied by a thread of its own.
+
+Invariants: chunks leave in order; none is dropped: a full spool makes `put` wait, which is how
+replay's rate limiter holds the arenas back.
+"""
+
+import queue
+import threading
+
+from common.errors import MrcdrlError
+from common.trajectory import Chunk
+from services.replay.client import ReplayWriter
+
+_POLL_S = 0.2
+
+
+class Sender:
+    """Sends chunks to replay in the background."""
+
+    def __init__(self, writer: ReplayWriter, spool_chunks: int) -> None:
+        self._writer = writer
+        self._spool: queue.Queue[Chunk] = queue.Queue(spool_chunks)
+        self._closing = threading.Event()
+        self._error: MrcdrlError | None = None
+        self._thread = threading.Thread(target=self._run, name="sender")
+        self.chunks = 0
+        self.transitions = 0
+        self._thread.start()
+
+    @property
+    def spooled(self) -> int:
+        """Chunks not acknowledged yet."""
+        return self._spool.qsize()
+
+    def put(self, chunk: Chunk, timeout_s: float) -> bool:
+        """Spool the chunk; False where there was no room within the time.
+
+        Raises the error that ended the sending: replay refused a chunk, and why.
+        """
+        if self._error is not None:
+            raise self._error
+        try:
+            self._spool.put(chunk, timeout=timeout_s)
+        except queue.Full:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Send what is spooled if replay takes it at once, then end the thread."""
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                chunk = self._spool.get(timeout=_POLL_S)
+            except queue.Empty:
+                if self._closing.is_set():
+                    return
+                continue
+            try:
+                reply = self._writer.insert(chunk)
+            except MrcdrlError as error:
+                self._error = error
+                return
+            if reply is None:
+                return
+            self.chunks += 1
+            self.transitions += len(chunk)

@@ -1,0 +1,61 @@
+"""Sums over the last seconds: how fast a counter runs, and how often a flag was set.
+
+Invariants: no clock inside, times come with the calls and do not fall; nothing older than the
+window is kept, so memory is bounded by the reports of one window.
+"""
+
+from collections import deque
+
+WINDOW_S = 10.0
+
+
+class Rate:
+    """Increments of one counter of one service over the last WINDOW_S seconds."""
+
+    def __init__(self, persistent: bool) -> None:
+        """persistent: the counter outlives its service, so when it falls (back to a checkpoint)
+        nothing was counted; otherwise it started again at 0."""
+        self._persistent = persistent
+        self._last: float | None = None
+        self._since_s = 0.0
+        self._increments: deque[tuple[float, float]] = deque()
+
+    def observe(self, value: float, now: float, restarted: bool = False) -> float:
+        """Takes the counter's value; returns what was counted since the value before."""
+        if self._last is None:
+            self._last, self._since_s = value, now
+            return value
+        increment = value - self._last
+        if increment < 0 or (restarted and not self._persistent):
+            increment = 0.0 if self._persistent else value
+        self._last = value
+        self._increments.append((now, increment))
+        self._forget(now)
+        return increment
+
+    def per_second(self, now: float) -> float:
+        """Counted in the window, over its seconds (fewer while it has not been seen so long)."""
+        self._forget(now)
+        span = min(WINDOW_S, now - self._since_s)
+        return sum(increment for _, increment in self._increments) / span if span > 0 else 0.0
+
+    def _forget(self, now: float) -> None:
+        while self._increments and self._increments[0][0] <= now - WINDOW_S:
+            self._increments.popleft()
+
+
+class Share:
+    """Mean of a flag or share over the reports of the last WINDOW_S seconds."""
+
+    def __init__(self) -> None:
+        self._values: deque[tuple[float, float]] = deque()
+
+    def observe(self, value: float, now: float) -> None:
+        self._values.append((now, value))
+        while self._values[0][0] <= now - WINDOW_S:
+            self._values.popleft()
+
+    @property
+    def mean(self) -> float:
+        """0 when nothing was reported."""
+        return sum(value for _, value in self._values) / max(1, len(self._values))

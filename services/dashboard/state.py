@@ -1,0 +1,267 @@
+"""What is known of a run: a fold of its messages into counters, rates, scores and who is there.
+
+Invariants: no clock, lock or transport inside; `now` is the seconds the run has lasted, over all
+its resumptions, and never falls; everything kept is bounded, except one byte an episode and one
+record an evaluation.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+from common.config import Config
+from common.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
+from services.dashboard.rates import Rate, Share
+from services.dashboard.records import EvaluationRecord
+
+ROLES = ("actor", "replay", "learner", "evaluator")
+# Counters of an actor start at 0 with it; those of the others are kept with the run.
+COUNTERS = {
+    "actor": ("env_steps", "robot_steps"),
+    "replay": ("inserts", "samples"),
+    "learner": ("learner_steps",),
+}
+SHARES = {
+    "actor": ("inference_share", "arena_share", "draw_share", "wait_share"),
+    "replay": ("insert_held", "sample_held"),
+    "learner": ("data_wait_share", "decode_share", "step_share", "publish_share"),
+}
+HUNDRED = 100
+HISTORY_PERIOD = 10  # episodes between two points of the curve of successes
+LOG_LINES = 100
+
+
+@dataclass(slots=True)
+class Service:
+    """One process of the run, as last heard of."""
+
+    role: str
+    id: str
+    alive: bool = True
+    heard_s: float | None = None  # when its stats last came
+    metrics: dict[str, float] = field(default_factory=dict)
+    text: dict[str, str] = field(default_factory=dict)
+    rates: dict[str, Rate] = field(default_factory=dict)
+    shares: dict[str, Share] = field(default_factory=dict)
+
+    def per_second(self, name: str, now: float) -> float:
+        """Rate of one of its counters; 0 for what it does not count."""
+        rate = self.rates.get(name)
+        return rate.per_second(now) if rate else 0.0
+
+    def share(self, name: str) -> float:
+        """Mean of one of its shares (0 ... 1) over the window."""
+        share = self.shares.get(name)
+        return share.mean if share else 0.0
+
+    def silent_s(self, now: float) -> float:
+        """Seconds since its last stats; infinite before the first."""
+        return math.inf if self.heard_s is None else max(0.0, now - self.heard_s)
+
+
+class RunState:
+    """The run as the dashboard knows it; `observe_*` folds in a message, the rest reads."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.log: deque[str] = deque(maxlen=LOG_LINES)
+        self.evaluations: list[EvaluationRecord] = []
+        self.episodes = 0
+        self.max_successes = 0  # of 100 consecutive episodes
+        self.success_history: list[int] = []  # successes_per_100, every HISTORY_PERIOD episodes
+        self.recent_scores: deque[float] = deque(maxlen=HUNDRED)
+        self.recent_q: deque[float] = deque(maxlen=HUNDRED)
+        self._outcomes = bytearray()
+        self._services: dict[tuple[str, str], Service] = {}
+        self._collected = {"env_steps": 0.0, "robot_steps": 0.0}
+
+    def __repr__(self) -> str:
+        return (
+            f"RunState(services={len(self._services)}, episodes={self.episodes}, "
+            f"successes={self.successes_per_100}, robot_steps={self.robot_steps}, "
+            f"learner_steps={self.learner_steps})"
+        )
+
+    # -- what happens ------------------------------------------------------------------
+
+    def observe_stats(self, stats: Stats, now: float) -> None:
+        """Takes a service's figures; a fallen counter or a new `incarnation` is a restart."""
+        service = self._service(stats.role, stats.id)
+        before = service.text.get("incarnation")
+        restarted = before is not None and before != stats.text.get("incarnation", before)
+        service.alive, service.heard_s = True, now
+        service.metrics, service.text = dict(stats.metrics), dict(stats.text)
+        for name in COUNTERS.get(stats.role, ()):
+            if name in stats.metrics:
+                rate = service.rates.setdefault(name, Rate(persistent=stats.role != "actor"))
+                counted = rate.observe(stats.metrics[name], now, restarted)
+                if name in self._collected:
+                    self._collected[name] += counted
+        for name in SHARES.get(stats.role, ()):
+            if name in stats.metrics:
+                service.shares.setdefault(name, Share()).observe(stats.metrics[name], now)
+
+    def observe_episode(self, episode: EpisodeSummary) -> None:
+        self.episodes += 1
+        self._outcomes.append(episode.outcome is Outcome.SUCCESS)
+        self.recent_scores.append(episode.score)
+        self.recent_q.append(episode.mean_q)
+        successes = self.successes_per_100
+        if successes is not None:
+            self.max_successes = max(self.max_successes, successes)
+            if self.episodes % HISTORY_PERIOD == 0:
+                self.success_history.append(successes)
+
+    def observe_evaluation(self, evaluation: Evaluation, now: float) -> EvaluationRecord:
+        """Takes an evaluation; returns it with how far collection was."""
+        record = EvaluationRecord(now, self.env_steps, self.robot_steps, evaluation)
+        self.evaluations.append(record)
+        return record
+
+    def observe_presence(self, role: str, service_id: str, alive: bool) -> None:
+        """A service's liveliness token came or went."""
+        self._service(role, service_id).alive = alive
+
+    def observe_log(self, line: str) -> None:
+        """A warning for the screen."""
+        self.log.append(line)
+
+    def restore_collected(self, env_steps: float, robot_steps: float) -> None:
+        """Adds what the actors of the run's earlier processes counted."""
+        self._collected["env_steps"] += env_steps
+        self._collected["robot_steps"] += robot_steps
+
+    def _service(self, role: str, service_id: str) -> Service:
+        return self._services.setdefault((role, service_id), Service(role, service_id))
+
+    # -- who is there -------------------------------------------------------------------
+
+    @property
+    def services(self) -> list[Service]:
+        """Every service ever heard of, along the ring, then by id."""
+        order = {role: index for index, role in enumerate(ROLES)}
+        return sorted(
+            self._services.values(), key=lambda s: (order.get(s.role, len(order)), s.role, s.id)
+        )
+
+    def alive(self, role: str) -> list[Service]:
+        """The services of a role that are there, by id."""
+        return [s for s in self.services if s.role == role and s.alive]
+
+    def gauges(self, role: str, name: str) -> list[float]:
+        """A metric of every service of a role that is there and reports it."""
+        return [s.metrics[name] for s in self.alive(role) if name in s.metrics]
+
+    def _known(self, role: str, name: str) -> float:
+        """Sum of a metric over a role's services, there or not."""
+        return sum(s.metrics.get(name, 0) for s in self._services.values() if s.role == role)
+
+    # -- counters and rates ---------------------------------------------------------------
+
+    @property
+    def env_steps(self) -> int:
+        return int(self._collected["env_steps"])
+
+    @property
+    def robot_steps(self) -> int:
+        return int(self._collected["robot_steps"])
+
+    @property
+    def learner_steps(self) -> int:
+        return int(self._known("learner", "learner_steps"))
+
+    @property
+    def weights_version(self) -> int:
+        return int(self._known("learner", "weights_version"))
+
+    @property
+    def inserts(self) -> int:
+        return int(self._known("replay", "inserts"))
+
+    @property
+    def samples(self) -> int:
+        return int(self._known("replay", "samples"))
+
+    def per_second(self, name: str, now: float) -> float:
+        """Rate of a counter over the last seconds, summed over all that count it: env_steps,
+        robot_steps, inserts, samples, learner_steps."""
+        return sum(service.per_second(name, now) for service in self._services.values())
+
+    def share(self, role: str, name: str) -> float:
+        """Mean of a share (0 ... 1) over the role's services that are there."""
+        services = self.alive(role)
+        return sum(s.share(name) for s in services) / max(1, len(services))
+
+    def staleness(self, actor: Service) -> tuple[int, float] | None:
+        """An actor's weights: versions behind the learner's, and seconds since it adopted them."""
+        learner = self.gauges("learner", "weights_version")
+        if not learner or "weights_version" not in actor.metrics:
+            return None
+        behind = max(0, int(max(learner) - actor.metrics["weights_version"]))
+        return behind, actor.metrics.get("weights_age_s", 0.0)
+
+    @property
+    def max_staleness(self) -> tuple[int, float]:
+        """The worst of all actors, in versions and in seconds, each by itself."""
+        known = [s for s in map(self.staleness, self.alive("actor")) if s is not None]
+        return max((b for b, _ in known), default=0), max((a for _, a in known), default=0.0)
+
+    # -- replay and exploration -----------------------------------------------------------
+
+    @property
+    def replay_size(self) -> int:
+        return int(sum(self.gauges("replay", "size")))
+
+    @property
+    def replay_capacity(self) -> int:
+        return int(sum(self.gauges("replay", "capacity"))) or self.config.replay.capacity
+
+    @property
+    def samples_per_insert(self) -> float | None:
+        """Transitions sampled for each inserted, as replay counts them; None before it does."""
+        reported = self.gauges("replay", "samples_per_insert")
+        return sum(reported) / len(reported) if reported else None
+
+    @property
+    def epsilons(self) -> tuple[float, float] | None:
+        """Least and greatest epsilon of all actors."""
+        low, high = self.gauges("actor", "epsilon_min"), self.gauges("actor", "epsilon_max")
+        return (min(low), max(high)) if low and high else None
+
+    # -- scores ---------------------------------------------------------------------------
+
+    @property
+    def successes_per_100(self) -> int | None:
+        """Successes of the last 100 episodes; None before there are as many."""
+        return sum(self._outcomes[-HUNDRED:]) if len(self._outcomes) >= HUNDRED else None
+
+    @property
+    def recent_successes(self) -> tuple[int, int]:
+        """Successes, and of how many: the last 100 episodes, or all while they are fewer."""
+        latest = self._outcomes[-HUNDRED:]
+        return sum(latest), len(latest)
+
+    @property
+    def hundreds(self) -> list[int]:
+        """Successes of the first, second, ... 100 episodes (Table 1, Fig. 6b)."""
+        whole = len(self._outcomes) // HUNDRED * HUNDRED
+        return [sum(self._outcomes[i : i + HUNDRED]) for i in range(0, whole, HUNDRED)]
+
+    @property
+    def last_evaluation(self) -> EvaluationRecord | None:
+        return self.evaluations[-1] if self.evaluations else None
+
+    @property
+    def best_evaluation(self) -> EvaluationRecord | None:
+        """Of the highest success rate; of equal ones the first."""
+        return max(self.evaluations, key=lambda r: r.evaluation.success_rate, default=None)
+
+    def time_left_s(self, now: float) -> float | None:
+        """Until `run.minutes` or, at the present rate, `run.learner_steps`; None: no end known."""
+        run, ends = self.config.run, []
+        if run.minutes:
+            ends.append(max(0.0, 60 * run.minutes - now))
+        rate = self.per_second("learner_steps", now)
+        if run.learner_steps and rate > 0:
+            ends.append(max(0.0, (run.learner_steps - self.learner_steps) / rate))
+        return min(ends, default=None)

@@ -1,0 +1,1 @@
+"""The evaluator: judges live weights by the paper's test."""

@@ -1,0 +1,68 @@
+"""From judged episodes to the figures of the paper's Table 2, with an interval.
+
+Invariant: the success, collision and time-out rates sum to 1. Pure.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.trajectory import Evaluation, Outcome, Weights
+from services.evaluator.trial import PER, EpisodeResult
+
+_Z95 = 1.959964  # of the normal distribution
+
+
+def wilson_interval(successes: int, count: int) -> tuple[float, float]:
+    """95 % interval of a rate (Wilson 1927)."""
+    if count == 0:
+        return (0.0, 1.0)
+    rate, z2 = successes / count, _Z95**2
+    centre = (rate + z2 / (2 * count)) / (1 + z2 / count)
+    half = _Z95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
+    return (max(0.0, centre - half), min(1.0, centre + half))
+
+
+def successes_per_100(results: Sequence[EpisodeResult]) -> list[float]:
+    """Successes of each full hundred; of fewer than a hundred, scaled to one."""
+    won = np.array([r.outcome is Outcome.SUCCESS for r in results])
+    blocks = [won[i : i + PER] for i in range(0, len(won), PER)]
+    full = [b for b in blocks if len(b) == PER] or blocks[:1]
+    return [float(b.mean() * PER) for b in full]
+
+
+def evaluation(
+    results: Sequence[EpisodeResult],
+    *,
+    worker: str,
+    weights: Weights,
+    num_robots: int,
+    seed: int,
+    wall_s: float,
+) -> Evaluation:
+    """The summary of these episodes."""
+    count = len(results)
+    outcomes = [r.outcome for r in results]
+    successes = outcomes.count(Outcome.SUCCESS)
+    blocks = np.array(successes_per_100(results))
+    frames = [r.frames for r in results if r.outcome is Outcome.SUCCESS]
+    return Evaluation(
+        worker=worker,
+        weights_epoch=weights.epoch,
+        weights_version=weights.version,
+        learner_step=weights.learner_step,
+        num_robots=num_robots,
+        episodes=count,
+        success_rate=successes / count,
+        collision_rate=outcomes.count(Outcome.COLLISION) / count,
+        timeout_rate=outcomes.count(Outcome.TIMEOUT) / count,
+        success_interval=wilson_interval(successes, count),
+        max_per_100=float(blocks.max()),
+        mean_per_100=float(blocks.mean()),
+        variance_per_100=float(blocks.var()),
+        mean_frames=float(np.mean(frames)) if frames else 0.0,
+        mean_score=float(np.mean([r.score for r in results])),
+        seed=seed,
+        wall_s=wall_s,
+    )

@@ -1,0 +1,169 @@
+"""The paper's test (section 5.3): given starts, one collision is failure, success within time.
+
+Invariants: the same starts, seed and weights give the same result; episodes are played many at
+once, each arena taking the next start when its episode ends.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.arena import Arena, ObservationCodec, Scene, Start
+from common.config import ArenaConfig
+from common.policy import FrameStack, Policy
+from common.trajectory import Float64Array, Outcome, TimeStep, UInt8Array
+
+_MAX_ARENAS = 64
+PER = 100  # episodes a block of Table 2
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """One judged episode."""
+
+    outcome: Outcome
+    frames: int
+    score: float  # sum of rewards, mean over robots
+    targets: Float64Array  # [K, 2] px
+    robots: Float64Array  # [frames + 1, K, 3]; [0, K, 3] where paths are not kept
+
+
+class Player(Protocol):
+    """Chooses the actions of several arenas at once."""
+
+    def begin(self, arena: int, time_step: TimeStep) -> None:
+        """An episode starts in this arena."""
+        ...
+
+    def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
+        """Actions [len(arenas), K]."""
+        ...
+
+    def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
+        """Records [len(arenas), K, R] after the step."""
+        ...
+
+
+class PolicyPlayer:
+    """Plays from pictures alone."""
+
+    def __init__(
+        self,
+        config: ArenaConfig,
+        codec: ObservationCodec,
+        policy: Policy,
+        epsilon: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._num_robots = config.num_robots
+        self._codec = codec
+        self._policy = policy
+        self._epsilon = epsilon
+        self._rng = rng
+        self._frames = FrameStack(_MAX_ARENAS * config.num_robots, config.stack, config.view_px)
+
+    def begin(self, arena: int, time_step: TimeStep) -> None:
+        first = arena * self._num_robots
+        robots = slice(first, first + self._num_robots)
+        self._frames.reset(robots, self._codec.decode(time_step.records))
+
+    def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
+        stacks = self._frames.stacks[self._robots(arenas)]
+        selection = self._policy.select_actions(stacks, self._epsilon, self._rng)
+        return selection.actions.reshape(len(arenas), self._num_robots)
+
+    def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
+        pictures = self._codec.decode(records.reshape(-1, records.shape[-1]))
+        self._frames.push(pictures, self._robots(arenas))
+
+    def _robots(self, arenas: NDArray[np.int64]) -> NDArray[np.int64]:
+        robots: NDArray[np.int64] = arenas[:, None] * self._num_robots + np.arange(self._num_robots)
+        return robots.reshape(-1)
+
+
+class ControllerPlayer:
+    """Plays by a controller that sees the true state; explores like the policy does."""
+
+    def __init__(
+        self,
+        controller: Callable[[Scene], UInt8Array],
+        epsilon: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._controller = controller
+        self._epsilon = epsilon
+        self._rng = rng
+
+    def begin(self, arena: int, time_step: TimeStep) -> None:
+        """Nothing to remember."""
+
+    def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
+        actions = np.stack([self._controller(scene) for scene in scenes])
+        explores = self._rng.random(actions.shape) < self._epsilon
+        uniform = self._rng.integers(3, size=actions.shape, dtype=np.uint8)
+        return np.where(explores, uniform, actions)
+
+    def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
+        """Nothing to remember."""
+
+
+@dataclass(slots=True)
+class _Running:
+    """An episode under way."""
+
+    number: int
+    score: float
+    path: list[Float64Array]
+
+
+def play(
+    config: ArenaConfig,
+    starts: Sequence[Start],
+    player: Player,
+    *,
+    keep_paths: bool = False,
+    go_on: Callable[[int], bool] = lambda _done: True,
+) -> list[EpisodeResult] | None:
+    """Results in the order of the starts; None where `go_on`, told how many are done, says no."""
+    rng = np.random.default_rng(0)  # unused: every start is given
+    arenas = [Arena(config, rng, max_collisions=1) for _ in range(min(len(starts), _MAX_ARENAS))]
+    results: dict[int, EpisodeResult] = {}
+    waiting = iter(enumerate(starts))
+    running: dict[int, _Running] = {}
+
+    def begin(index: int) -> None:
+        following = next(waiting, None)
+        if following is None:
+            running.pop(index, None)
+            return
+        number, start = following
+        player.begin(index, arenas[index].reset(start))
+        running[index] = _Running(number, 0.0, [arenas[index].scene.robots])
+
+    for index in range(len(arenas)):
+        begin(index)
+    while running:
+        if not go_on(len(results)):
+            return None
+        active = np.array(sorted(running))
+        actions = player.act(active, [arenas[i].scene for i in active])
+        steps = [arenas[i].step(a) for i, a in zip(active, actions, strict=True)]
+        player.observe(active, np.stack([s.records for s in steps]))
+        for index, time_step in zip(active.tolist(), steps, strict=True):
+            episode = running[index]
+            episode.score += float(time_step.rewards.mean())
+            if keep_paths:
+                episode.path.append(arenas[index].scene.robots)
+            if time_step.outcome is not None:
+                results[episode.number] = EpisodeResult(
+                    outcome=time_step.outcome,
+                    frames=arenas[index].frame,
+                    score=episode.score,
+                    targets=arenas[index].scene.targets,
+                    robots=np.stack(episode.path) if keep_paths else np.empty((0, 0, 3)),
+                )
+                begin(index)
+    return [results[number] for number in range(len(starts))]

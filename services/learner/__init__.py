@@ -1,0 +1,1 @@
+"""The learner: pulls mini-batches, updates the network, publishes its weights."""

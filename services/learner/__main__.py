@@ -1,0 +1,109 @@
+"""`mrcdrl learner`: join a run, learn from its replay, publish weights, keep checkpoints."""
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+
+from common.arena import layout_symmetries, make_codec
+from common.config import Config
+from common.process import (
+    StatsReporter,
+    StopSignal,
+    available_cores,
+    fetch_config,
+    joining_arguments,
+    run_main,
+)
+from common.trajectory import Samples
+from common.transport import Session
+from common.weights import WeightsWriter
+from services.learner.batch import Batch, collate
+from services.learner.keeper import Keeper
+from services.learner.learner import Learner
+from services.learner.meter import Meter
+from services.learner.prefetch import Prefetcher
+from services.replay.client import ReplayReader
+
+_LOG = logging.getLogger("learner")
+_POLL_S = 0.2
+
+
+def main(argv: Sequence[str]) -> int:
+    """Learn for a run; the exit code."""
+    joining = joining_arguments("learner", argv)
+    keys, worker = joining.keys, joining.worker
+    stop = StopSignal().listen()
+    with Session(joining.transport) as session, Session(joining.transport) as bulk:
+        config = fetch_config(session, joining, stop)
+        settings = config.learner
+        torch.set_num_threads(settings.threads or max(1, available_cores() - 1))
+        learner = Learner(
+            config.agent, settings, stack=config.arena.stack, view_px=config.arena.view_px
+        )
+        keeper = Keeper(config, learner, joining.run_dir / "checkpoints")
+        reader = ReplayReader(
+            bulk, keys, settings.batch_size, settings.requests_in_flight, settings.warn_s, stop
+        )
+        prefetcher = Prefetcher(
+            reader, make_collate(config, learner), settings.prefetch_batches, stop
+        )
+        writer = WeightsWriter(session, keys)
+        reporter = StatsReporter(
+            session.publisher(keys.stats("learner", worker)), "learner", worker
+        )
+        session.announce(keys.live("learner", worker))
+        _LOG.info("%s, %d threads", learner, torch.get_num_threads())
+        try:
+            run(config, learner, prefetcher, writer, keeper, reporter, stop)
+        finally:
+            stop.set()
+            prefetcher.close()
+            writer.close()
+    return 0
+
+
+def run(
+    config: Config,
+    learner: Learner,
+    prefetcher: Prefetcher,
+    writer: WeightsWriter,
+    keeper: Keeper,
+    reporter: StatsReporter,
+    stop: StopSignal,
+) -> None:
+    """Learn until stopped or run.learner_steps is reached; leaves a last checkpoint."""
+    meter = Meter(learner, prefetcher, keeper)
+    writer.publish(keeper.next_weights())
+    limit = config.run.learner_steps
+    while not stop.is_set() and (not limit or learner.learner_step < limit):
+        batch = meter.timed("data_wait", lambda: prefetcher.next(_POLL_S))
+        if batch is not None:
+            meter.last = meter.timed("step", partial(learner.step, batch))
+            if learner.learner_step % config.learner.publish_period == 0:
+                meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
+            meter.timed("checkpoint", keeper.maybe_save)
+        reporter.maybe(meter.metrics)
+    writer.publish(keeper.next_weights())
+    keeper.save(final=True)
+    reporter.now(meter.metrics)
+    _LOG.info("stopped at learner step %d", learner.learner_step)
+
+
+def make_collate(config: Config, learner: Learner) -> Callable[[Samples], Batch]:
+    """From samples to the batch of one step, pictures drawn."""
+    symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
+    return partial(
+        collate,
+        decode=make_codec(config.arena).decode,
+        stack=config.arena.stack,
+        symmetries=symmetries,
+        rng=learner.rng,
+        device=learner.device,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(run_main(lambda: main(sys.argv[1:])))

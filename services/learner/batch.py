@@ -1,0 +1,117 @@
+"""From sampled records to the tensors of one learner step.
+
+Invariants: every record is decoded once; a transition's pictures and its action undergo the same
+symmetry; stacking states out of single pictures happens here only.
+
+Shapes: B = transitions, W = records a transition may touch, R = bytes of a record, S = pictures
+stacked in a state, V = width of a picture in px.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from common.errors import WireError
+from common.network import NUM_ACTIONS
+from common.trajectory import Float32Array, Samples, UInt8Array
+
+
+class Symmetry(Protocol):
+    """A turn or mirroring of the arena, as it shows in pictures and actions."""
+
+    def apply_to_pictures(self, pictures: UInt8Array, /) -> UInt8Array:
+        """uint8 [..., V, V] to the same shape."""
+        ...
+
+    def apply_to_actions(self, actions: UInt8Array, /) -> UInt8Array:
+        """uint8 [...] to the same shape: mirrored, left is right."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What one learner step reads."""
+
+    observation: torch.Tensor  # uint8 [B, S, V, V], may be a view with strides
+    action: torch.Tensor  # int64 [B]
+    reward: torch.Tensor  # float32 [B], n-step return
+    discount: torch.Tensor  # float32 [B], gamma**k, 0 after a termination
+    next_observation: torch.Tensor  # uint8 [B, S, V, V], k steps later
+    importance_weights: torch.Tensor  # float32 [B], largest is 1
+
+
+def importance_weights(samples: Samples, beta: float) -> Float32Array:
+    """(1 / (N p)) ** beta over its largest, float32 [B] (prioritized replay, section 3.4)."""
+    weights = np.power(samples.table_size * samples.probabilities, -beta)
+    largest: np.float64 = weights.max()
+    return (weights / largest).astype(np.float32)
+
+
+def collate(
+    samples: Samples,
+    decode: Callable[[UInt8Array], UInt8Array],
+    stack: int,
+    *,
+    symmetries: Sequence[Symmetry] = (),
+    rng: np.random.Generator | None = None,
+    beta: float = 0.0,
+    device: str | torch.device = "cpu",
+) -> Batch:
+    """The batch of these samples.
+
+    decode: records uint8 [B, W, R] to pictures uint8 [B, W, V, V]. symmetries: one is drawn by
+    rng for each transition; include the identity among them. beta: of the importance weights; 0
+    makes them 1.
+
+    Raises WireError if an action or a bootstrap offset is outside what the records hold.
+    """
+    _check(samples, stack)
+    pictures = decode(samples.records)
+    actions = samples.actions
+    if symmetries:
+        if rng is None:
+            raise ValueError("symmetries are drawn at random: give an rng")
+        drawn = rng.integers(len(symmetries), size=len(samples))
+        pictures, actions = _transform(pictures, actions, symmetries, drawn)
+    writable = np.require(pictures, requirements=["C", "W"])  # bytes off the wire are neither
+    on_device = torch.from_numpy(writable).to(device)
+    offsets = torch.from_numpy(samples.bootstrap_offsets.astype(np.int64)).to(device)
+    rows = torch.arange(len(samples), device=device)[:, None]
+    window = offsets[:, None] + torch.arange(stack, device=device)
+    return Batch(
+        observation=on_device[:, :stack],
+        action=torch.from_numpy(actions.astype(np.int64)).to(device),
+        reward=torch.from_numpy(samples.rewards.astype(np.float32)).to(device),
+        discount=torch.from_numpy(samples.discounts.astype(np.float32)).to(device),
+        next_observation=on_device[rows, window],
+        importance_weights=torch.from_numpy(importance_weights(samples, beta)).to(device),
+    )
+
+
+def _check(samples: Samples, stack: int) -> None:
+    if len(samples) == 0:
+        raise WireError("a batch without transitions")
+    if int(samples.actions.max()) >= NUM_ACTIONS:
+        raise WireError(f"action {samples.actions.max()} is none of {NUM_ACTIONS}")
+    width, last = samples.records.shape[1], int(samples.bootstrap_offsets.max()) + stack
+    if last > width:
+        raise WireError(f"a transition needs {last} records and has {width}")
+
+
+def _transform(
+    pictures: UInt8Array,
+    actions: UInt8Array,
+    symmetries: Sequence[Symmetry],
+    drawn: np.ndarray[tuple[int], np.dtype[np.int64]],
+) -> tuple[UInt8Array, UInt8Array]:
+    """Pictures [B, W, V, V] and actions [B], each row under the symmetry drawn for it."""
+    new_pictures, new_actions = np.empty_like(pictures), np.empty_like(actions)
+    for index, symmetry in enumerate(symmetries):
+        rows = np.flatnonzero(drawn == index)
+        if rows.size:
+            new_pictures[rows] = symmetry.apply_to_pictures(pictures[rows])
+            new_actions[rows] = symmetry.apply_to_actions(actions[rows])
+    return new_pictures, new_actions

@@ -1,0 +1,187 @@
+"""Checkpoints of the learner: folders that are whole or not there.
+
+    checkpoints/step_000001234/
+        model.safetensors  target.safetensors  optimizer.safetensors  manifest.json
+
+Invariants: a folder gets its name when all in it is on the disk; the manifest holds the digest
+of every file; a reader takes the newest folder whose digests are right and says which it passed
+over; nothing is unpickled. One process writes, any may read.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from common.errors import CheckpointError
+from common.files import TEMPORARY_SUFFIX, reason, sha256, sync_directory, write_synced
+from services.learner.learner import LearnerState
+
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+_PREFIX = "step_"
+_FILES = ("model", "target", "optimizer")
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A learner's state, and which weights it had published."""
+
+    state: LearnerState
+    weights_epoch: int
+    weights_version: int  # of the last publication; the next is larger
+    config_digest: str  # of the configuration it was learned with
+    unix_time_s: float  # when it was taken
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """The newest whole checkpoint, and why newer ones were passed over."""
+
+    checkpoint: Checkpoint
+    path: Path
+    passed_over: tuple[str, ...]  # one line each, newest first
+
+
+def save(directory: Path, checkpoint: Checkpoint, *, keep: int) -> Path:
+    """Write a checkpoint below `directory`, then delete all but the newest `keep`.
+
+    Raises CheckpointError if the disk is full or the folder cannot be written; then nothing
+    half-written is left and the older checkpoints are as they were.
+    """
+    if keep < 1:
+        raise ValueError(f"keep = {keep} would delete the checkpoint just written")
+    path = directory / f"{_PREFIX}{checkpoint.state.learner_step:09d}"
+    temporary = directory / f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(directory)
+        _write(temporary, checkpoint)
+        if path.exists():  # the same step again; rename cannot replace a folder that holds files
+            path.rename(temporary.with_suffix(f".old{TEMPORARY_SUFFIX}"))
+        temporary.rename(path)
+        sync_directory(directory)
+        _remove_leftovers(directory)
+        for old in _newest_first(directory)[keep:]:
+            shutil.rmtree(old)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise CheckpointError(f"checkpoint {path} not written: {reason(error)}") from error
+    return path
+
+
+def latest(directory: Path) -> Path | None:
+    """The newest checkpoint by its manifest, its other files not yet looked at."""
+    found = _newest_first(directory)
+    return found[0] if found else None
+
+
+def load(path: Path) -> Checkpoint:
+    """One checkpoint, every digest verified; raises CheckpointError saying what is wrong."""
+    manifest = _read_manifest(path)
+    contents = {name: _read_file(path / f"{name}.safetensors", manifest) for name in _FILES}
+    try:
+        return Checkpoint(
+            state=LearnerState(
+                learner_step=int(manifest["learner_step"]),
+                model=contents["model"],
+                target=contents["target"],
+                optimizer=contents["optimizer"],
+                rng_state=dict(manifest["rng_state"]),
+            ),
+            weights_epoch=int(manifest["weights_epoch"]),
+            weights_version=int(manifest["weights_version"]),
+            config_digest=str(manifest["config_digest"]),
+            unix_time_s=float(manifest["unix_time_s"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"checkpoint {path}: its manifest lacks or spoils {error}") from error
+
+
+def load_latest(directory: Path) -> Loaded | None:
+    """The newest whole checkpoint; None if there is none at all.
+
+    Raises CheckpointError if there are some and none is whole: whoever asked to go on must not
+    start anew unawares.
+    """
+    found = _newest_first(directory)
+    passed_over: list[str] = []
+    for path in found:
+        try:
+            return Loaded(load(path), path, tuple(passed_over))
+        except CheckpointError as error:
+            passed_over.append(str(error))
+    if found:
+        raise CheckpointError(f"no checkpoint of {len(found)} is whole; newest: {passed_over[0]}")
+    return None
+
+
+def _write(folder: Path, checkpoint: Checkpoint) -> None:
+    state = checkpoint.state
+    contents = {"model": state.model, "target": state.target, "optimizer": state.optimizer}
+    manifest = {
+        "format_version": FORMAT_VERSION,
+        "learner_step": state.learner_step,
+        "weights_epoch": checkpoint.weights_epoch,
+        "weights_version": checkpoint.weights_version,
+        "config_digest": checkpoint.config_digest,
+        "unix_time_s": checkpoint.unix_time_s,
+        "rng_state": state.rng_state,
+        "sha256": {f"{name}.safetensors": sha256(data) for name, data in contents.items()},
+    }
+    folder.mkdir()
+    for name, data in contents.items():
+        write_synced(folder / f"{name}.safetensors", data)
+    write_synced(folder / MANIFEST, json.dumps(manifest, indent=2).encode())
+    sync_directory(folder)
+
+
+def _remove_leftovers(directory: Path) -> None:
+    """Of saves that were killed."""
+    for leftover in directory.glob(f".{_PREFIX}*{TEMPORARY_SUFFIX}"):
+        shutil.rmtree(leftover)
+
+
+def _newest_first(directory: Path) -> list[Path]:
+    """Checkpoints by (epoch, version, step); those without a readable manifest come last."""
+
+    def age(path: Path) -> tuple[int, int, int]:
+        try:
+            manifest = _read_manifest(path)
+            return (
+                int(manifest["weights_epoch"]),
+                int(manifest["weights_version"]),
+                int(manifest["learner_step"]),
+            )
+        except (CheckpointError, KeyError, TypeError, ValueError):
+            return (-1, -1, -1)
+
+    return sorted(directory.glob(f"{_PREFIX}*"), key=lambda path: (age(path), path), reverse=True)
+
+
+def _read_manifest(path: Path) -> Mapping[str, Any]:
+    try:
+        manifest = json.loads((path / MANIFEST).read_bytes())
+    except OSError as error:
+        raise CheckpointError(f"checkpoint {path}: {MANIFEST}: {reason(error)}") from error
+    except ValueError as error:
+        raise CheckpointError(f"checkpoint {path}: {MANIFEST} is damaged") from error
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("sha256"), dict):
+        raise CheckpointError(f"checkpoint {path}: {MANIFEST} is damaged")
+    if manifest.get("format_version") != FORMAT_VERSION:
+        version = manifest.get("format_version")
+        raise CheckpointError(f"checkpoint {path} has format {version!r}, not {FORMAT_VERSION}")
+    return manifest
+
+
+def _read_file(path: Path, manifest: Mapping[str, Any]) -> bytes:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"checkpoint {path}: {reason(error)}") from error
+    if sha256(content) != manifest["sha256"].get(path.name):
+        raise CheckpointError(f"checkpoint {path} is damaged: its digest is not the manifest's")
+    return content

@@ -1,0 +1,48 @@
+"""Where the learner's time goes, and what its last step said."""
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from services.learner.keeper import Keeper
+from services.learner.learner import Learner, Update
+from services.learner.prefetch import Prefetcher
+
+T = TypeVar("T")
+
+
+class Meter:
+    """Times the stages of the learner's loop."""
+
+    def __init__(self, learner: Learner, prefetcher: Prefetcher, keeper: Keeper) -> None:
+        self._learner = learner
+        self._prefetcher = prefetcher
+        self._keeper = keeper
+        self._seconds = dict.fromkeys(("data_wait", "step", "publish", "checkpoint"), 0.0)
+        self._started_s = time.perf_counter()
+        self.last: Update | None = None
+
+    def timed(self, stage: str, work: Callable[[], T]) -> T:
+        """Do the work; its time counts for the stage."""
+        started = time.perf_counter()
+        result = work()
+        self._seconds[stage] += time.perf_counter() - started
+        return result
+
+    def metrics(self) -> dict[str, float]:
+        """Shares are of the time since the start; decoding runs beside the other stages."""
+        lived_s = max(time.perf_counter() - self._started_s, 1e-9)
+        metrics = {
+            "learner_steps": self._learner.learner_step,
+            "weights_version": self._keeper.version,
+            "weights_epoch": self._keeper.epoch,
+            "batches_ready": self._prefetcher.ready,
+            "decode_share": self._prefetcher.decode_s / lived_s,
+        }
+        metrics |= {f"{stage}_share": s / lived_s for stage, s in self._seconds.items()}
+        if self.last is not None:
+            metrics["loss"] = float(self.last.loss)
+            metrics["mean_q"] = float(self.last.mean_q)
+            metrics["td_error_mean"] = float(self.last.td_errors.abs().mean())
+            metrics["gradient_norm"] = float(self.last.gradient_norm)
+        return metrics

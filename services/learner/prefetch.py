@@ -1,0 +1,81 @@
+"""Mini-batches fetched and decoded by a thread of its own while the learner computes.
+
+Invariant: at most `depth` decoded batches wait; when they do, no further one is asked for.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+
+from common.errors import MrcdrlError
+from common.process import StopSignal
+from common.trajectory import Samples
+from services.learner.batch import Batch
+from services.replay.client import ReplayReader
+
+_POLL_S = 0.2
+
+
+class Prefetcher:
+    """Keeps batches ready."""
+
+    def __init__(
+        self,
+        reader: ReplayReader,
+        collate: Callable[[Samples], Batch],
+        depth: int,
+        stop: StopSignal,
+    ) -> None:
+        self._reader = reader
+        self._collate = collate
+        self._ready: queue.Queue[Batch] = queue.Queue(depth)
+        self._stop = stop
+        self._error: Exception | None = None
+        self.decode_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="prefetch")
+        self._thread.start()
+
+    @property
+    def ready(self) -> int:
+        """Batches that wait."""
+        return self._ready.qsize()
+
+    @property
+    def held_for(self) -> str:
+        """Why replay holds the requests; empty where it does not."""
+        return self._reader.held_for
+
+    def next(self, timeout_s: float) -> Batch | None:
+        """The next batch; None where none is ready within the time.
+
+        Raises the error that ended the fetching.
+        """
+        try:
+            return self._ready.get(timeout=timeout_s)
+        except queue.Empty:
+            if self._error is not None:
+                raise self._error from None
+            return None
+
+    def close(self) -> None:
+        """End the thread; the stop signal must be set."""
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while (samples := self._reader.sample()) is not None:
+                started = time.perf_counter()
+                batch = self._collate(samples)
+                self.decode_s += time.perf_counter() - started
+                self._put(batch)
+        except MrcdrlError as error:
+            self._error = error
+
+    def _put(self, batch: Batch) -> None:
+        while not self._stop.is_set():
+            try:
+                self._ready.put(batch, timeout=_POLL_S)
+            except queue.Full:
+                continue
+            return

@@ -1,0 +1,1 @@
+"""The replay service: keeps transitions, and hands out mini-batches of them."""

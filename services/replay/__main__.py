@@ -1,0 +1,82 @@
+"""`mrcdrl replay`: read the configuration, wire the table to Zenoh, serve until told to stop."""
+
+import logging
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.arguments import Parser, add_config_flags, overrides
+from common.config import Config, load_config, to_toml
+from common.keys import Keys, check_name
+from common.process import StatsReporter, StopSignal, run_main
+from common.transport import Session
+from services.replay.limiter import RateLimiter
+from services.replay.service import ReplayService
+from services.replay.table import Table
+
+_LOG = logging.getLogger("replay")
+_TICK_S = 0.2
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serve a run's replay; the exit code."""
+    parser = Parser(prog="mrcdrl replay", description="Serve the replay table of a run.")
+    parser.add_argument("--run", required=True, help="the run's name")
+    parser.add_argument("--config", help="a preset or a TOML file")
+    parser.add_argument("--listen", action="append", help="endpoint, such as tcp/127.0.0.1:7447")
+    parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
+    parser.add_argument("--id", default="replay-0", help="this worker's name")
+    add_config_flags(parser)
+    arguments = parser.parse_args(argv)
+    config = load_config(arguments.config, overrides(arguments))
+    transport = config.transport.model_copy(
+        update={
+            "listen": tuple(arguments.listen or config.transport.listen),
+            "connect": tuple(arguments.connect or config.transport.connect),
+        }
+    )
+    keys = Keys(arguments.run)
+    worker = check_name(arguments.id, "--id")
+    stop = StopSignal().listen()
+    table, limiter = build(config)
+    with Session(transport) as session:
+        configs = session.server(keys.config)
+        inserts, samples = session.server(keys.insert()), session.server(keys.sample())
+        reporter = StatsReporter(session.publisher(keys.stats("replay", worker)), "replay", worker)
+        service = ReplayService(config, table, limiter, inserts, samples)
+        service.start()
+        session.announce(keys.live("replay", worker))
+        _LOG.info("serving %s of %d transitions", arguments.run, config.replay.capacity)
+        shared = to_toml(config).encode()
+        try:
+            while not stop.is_set() and service.healthy:
+                request = configs.take(_TICK_S)
+                if request is not None:
+                    request.reply(shared)
+                reporter.maybe(service.metrics)
+        finally:
+            service.stop()
+    return 0 if stop.is_set() else 1
+
+
+def build(config: Config) -> tuple[Table, RateLimiter]:
+    """The table and limiter a configuration asks for."""
+    table = Table(
+        capacity=config.replay.capacity,
+        window=config.arena.stack + config.agent.n_step,
+        record_bytes=config.arena.record_bytes,
+        rng=np.random.default_rng(config.replay.seed),
+    )
+    limiter = RateLimiter.with_tolerance(
+        config.replay.samples_per_insert,
+        config.replay.min_size,
+        config.replay.tolerance,
+        largest_insert=config.actor.chunk_length,
+        largest_sample=config.learner.batch_size,
+    )
+    return table, limiter
+
+
+if __name__ == "__main__":
+    sys.exit(run_main(lambda: main(sys.argv[1:])))

@@ -1,0 +1,73 @@
+"""The rate limiter: counters and limits only (Reverb's), so that the table's owner may ask it.
+
+Invariant: once `min_size` is reached, samples stay within `error_buffer` of
+`samples_per_insert` x (inserts - min_size) whenever both sides ask before they act.
+"""
+
+from dataclasses import dataclass
+
+from common.errors import ConfigError
+
+
+@dataclass(slots=True)
+class RateLimiter:
+    """Holds inserts and samples to a ratio.
+
+    samples_per_insert: transitions sampled for each inserted; 0: no limit. min_size: inserts
+    before the first sample. error_buffer: samples by which either side may run ahead.
+    largest_insert, largest_sample: transitions of one request, for the deadlock check.
+
+    Raises ConfigError when the settings would deadlock.
+    """
+
+    samples_per_insert: float
+    min_size: int
+    error_buffer: float
+    largest_insert: int
+    largest_sample: int
+    inserts: int = 0
+    samples: int = 0
+
+    def __post_init__(self) -> None:
+        if self.samples_per_insert < 0 or self.min_size < 1:
+            raise ConfigError("the rate limiter needs samples_per_insert >= 0 and min_size >= 1")
+        needed = max(self.samples_per_insert * self.largest_insert, self.largest_sample)
+        if self.samples_per_insert and self.error_buffer < needed:
+            raise ConfigError(
+                f"replay.tolerance allows {self.error_buffer:.0f} samples of lead, one request "
+                f"moves {needed:.0f}: actors and learner would wait for each other for ever"
+            )
+
+    @classmethod
+    def with_tolerance(
+        cls,
+        samples_per_insert: float,
+        min_size: int,
+        tolerance: float,
+        largest_insert: int,
+        largest_sample: int,
+    ) -> "RateLimiter":
+        """With an error buffer of `tolerance` x min_size x ratio, at least two requests' worth."""
+        one_request = max(samples_per_insert * largest_insert, largest_sample)
+        buffer = max(tolerance * min_size * samples_per_insert, 2.0 * one_request)
+        return cls(samples_per_insert, min_size, buffer, largest_insert, largest_sample)
+
+    @property
+    def _lead(self) -> float:
+        """Samples still due for what was inserted; negative: the learner is ahead."""
+        return (self.inserts - self.min_size) * self.samples_per_insert - self.samples
+
+    def can_insert(self, count: int) -> bool:
+        if not self.samples_per_insert or self.inserts + count <= self.min_size:
+            return True
+        return self._lead + count * self.samples_per_insert <= self.error_buffer
+
+    def can_sample(self, count: int) -> bool:
+        if self.inserts < self.min_size:
+            return False
+        return not self.samples_per_insert or self._lead - count >= -self.error_buffer
+
+    @property
+    def ratio(self) -> float:
+        """Samples per insert so far, counted from the first insert that could be sampled."""
+        return self.samples / max(self.inserts - self.min_size, 1)

@@ -1,0 +1,37 @@
+"""Which chunks arrived already: (actor, incarnation, sequence) makes a repeated insert harmless.
+
+Invariant: memory is bounded by `max_streams`; the streams heard of least recently go first.
+"""
+
+from collections import OrderedDict
+from enum import Enum, auto
+
+
+class Arrival(Enum):
+    """What a sequence number says of its chunk."""
+
+    NEXT = auto()
+    REPEATED = auto()
+    GAP = auto()
+
+
+class SequenceBook:
+    """The last sequence number of every (actor, incarnation)."""
+
+    def __init__(self, max_streams: int = 4096) -> None:
+        self._last: OrderedDict[tuple[str, int], int] = OrderedDict()
+        self._max_streams = max_streams
+
+    def classify(self, actor: str, incarnation: int, sequence: int) -> Arrival:
+        """Whether the chunk is the next one, was here before, or skips some."""
+        last = self._last.get((actor, incarnation), -1)
+        if sequence <= last:
+            return Arrival.REPEATED
+        return Arrival.NEXT if sequence == last + 1 else Arrival.GAP
+
+    def record(self, actor: str, incarnation: int, sequence: int) -> None:
+        """Remember that the chunk is stored."""
+        self._last[actor, incarnation] = sequence
+        self._last.move_to_end((actor, incarnation))
+        while len(self._last) > self._max_streams:
+            self._last.popitem(last=False)

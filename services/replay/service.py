@@ -1,0 +1,154 @@
+"""The shell around the table: one thread inserts, one samples, under one lock.
+
+Invariants: a chunk is acknowledged only after it is in the table; a request is answered within
+`hold_s`, by the data, a refusal with its reason, or "held", which asks the peer to try again.
+"""
+
+import threading
+import time
+from typing import Protocol
+
+from common.config import Config
+from common.errors import WireError
+from common.trajectory import Chunk, InsertReply
+from common.wire import SampleRequest, decode, encode
+from services.replay.limiter import RateLimiter
+from services.replay.sequence import Arrival, SequenceBook
+from services.replay.table import Table
+
+_TAKE_S = 0.2  # how soon a thread sees that it is to stop
+
+
+class _Request(Protocol):
+    """What the service needs of a transport's request."""
+
+    payload: bytes
+    arrived_s: float
+
+    def reply(self, payload: bytes) -> None: ...
+    def refuse(self, reason: str) -> None: ...
+    def hold(self, reason: str) -> None: ...
+
+
+class _Server(Protocol):
+    def take(self, timeout_s: float) -> _Request | None: ...
+
+
+class ReplayService:
+    """Serves inserts and samples until `stop`."""
+
+    def __init__(
+        self, config: Config, table: Table, limiter: RateLimiter, inserts: _Server, samples: _Server
+    ) -> None:
+        self._config = config
+        self._table = table
+        self._limiter = limiter
+        self._book = SequenceBook()
+        self._changed = threading.Condition()
+        self._stopping = threading.Event()
+        self._counts = dict.fromkeys(("chunks", "duplicates", "gaps", "refused"), 0)
+        self._held = {"insert_held": False, "sample_held": False}
+        self._threads = [
+            threading.Thread(target=self._serve, args=(inserts, self._insert), name="insert"),
+            threading.Thread(target=self._serve, args=(samples, self._sample), name="sample"),
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Answer what is being served, then end both threads."""
+        self._stopping.set()
+        with self._changed:
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
+
+    @property
+    def healthy(self) -> bool:
+        """Both threads live; one that died of a bug of ours ends the service."""
+        return all(thread.is_alive() for thread in self._threads)
+
+    def metrics(self) -> dict[str, float]:
+        with self._changed:
+            return {
+                "size": len(self._table),
+                "capacity": self._table.capacity,
+                "min_size": self._limiter.min_size,
+                "inserts": self._limiter.inserts,
+                "samples": self._limiter.samples,
+                "samples_per_insert": self._limiter.ratio,
+                "bytes": self._table.nbytes,
+                **self._counts,
+                **self._held,
+            }
+
+    def _serve(self, server: _Server, answer: "_Answer") -> None:
+        while not self._stopping.is_set():
+            request = server.take(_TAKE_S)
+            if request is None:
+                continue
+            try:
+                answer(request)
+            except WireError as error:
+                with self._changed:
+                    self._counts["refused"] += 1
+                request.refuse(str(error))
+
+    def _insert(self, request: _Request) -> None:
+        chunk = decode(Chunk, request.payload)
+        self._table.check(chunk)
+        with self._changed:
+            arrival = self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
+            if arrival is Arrival.REPEATED:
+                self._counts["duplicates"] += 1
+            elif self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
+                self._table.insert(chunk)
+                self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
+                self._limiter.inserts += len(chunk)
+                self._counts["chunks"] += 1
+                self._counts["gaps"] += arrival is Arrival.GAP
+                self._changed.notify_all()
+            else:
+                request.hold("the learner has not sampled enough of what is there yet")
+                return
+            total = self._limiter.inserts
+        request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
+
+    def _sample(self, request: _Request) -> None:
+        size = decode(SampleRequest, request.payload).batch_size
+        if not 1 <= size <= self._limiter.largest_sample:
+            raise WireError(f"batch_size {size} is outside 1 ... {self._limiter.largest_sample}")
+        with self._changed:
+            if not self._wait("sample_held", request, lambda: self._limiter.can_sample(size)):
+                request.hold(self._why_no_sample())
+                return
+            samples = self._table.sample(size)
+            self._limiter.samples += size
+            self._changed.notify_all()
+        request.reply(encode(samples))
+
+    def _wait(self, flag: str, request: _Request, ready: "_Ready") -> bool:
+        """Wait, the lock given up meanwhile, until ready; False where that took too long."""
+        if ready():
+            return True
+        self._held[flag] = True
+        left = request.arrived_s + self._config.replay.hold_s - time.monotonic()
+        self._changed.wait_for(lambda: self._stopping.is_set() or ready(), max(left, 0.0))
+        self._held[flag] = not ready()
+        return ready() and not self._stopping.is_set()
+
+    def _why_no_sample(self) -> str:
+        limiter = self._limiter
+        if limiter.inserts < limiter.min_size:
+            return f"the table holds {limiter.inserts} of the first {limiter.min_size} transitions"
+        return "the actors have not inserted enough for another sample yet"
+
+
+class _Answer(Protocol):
+    def __call__(self, request: _Request) -> None: ...
+
+
+class _Ready(Protocol):
+    def __call__(self) -> bool: ...

@@ -1,0 +1,168 @@
+"""The table: a ring of observation records in stream order, and the transitions over them.
+
+Invariants (`check_invariants`): transition keys are consecutive, the newest `size` of all ever
+inserted; each touches `window` consecutive rows of one chunk that is whole in the ring; rows of
+different chunks never overlap. Pure: no clock, lock or transport.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from common.errors import ConfigError, WireError
+from common.trajectory import Chunk, Samples, UInt8Array
+
+_ROW_SLACK = 1.25  # rows a transition: history, bootstrap tail and short last chunks
+
+
+@dataclass(frozen=True, slots=True)
+class _Extent:
+    """Where a chunk lies."""
+
+    first_key: int
+    num_transitions: int
+    first_row: int
+    num_rows: int
+
+
+class Table:
+    """First in, first out, sampled uniformly with replacement.
+
+    capacity: transitions. window: records one transition touches (stack + n). record_bytes:
+    length of one record. rng: draws the samples.
+    """
+
+    def __init__(
+        self, capacity: int, window: int, record_bytes: int, rng: np.random.Generator
+    ) -> None:
+        num_rows = int(capacity * _ROW_SLACK) + 2 * window
+        try:
+            self._rows: UInt8Array = np.zeros((num_rows, record_bytes), np.uint8)
+        except MemoryError as error:
+            raise ConfigError(
+                f"replay.capacity {capacity} needs {num_rows * record_bytes >> 20} MiB for its "
+                "records, more than this machine gives; lower it"
+            ) from error
+        self._capacity = capacity
+        self._window = window
+        # [num_rows - window + 1, window, R], a view: sampling is one gather of contiguous spans.
+        self._windows = sliding_window_view(self._rows, window, axis=0).transpose(0, 2, 1)
+        self._start_rows = np.zeros(capacity, np.int64)
+        self._actions = np.zeros(capacity, np.uint8)
+        self._rewards = np.zeros(capacity, np.float32)
+        self._discounts = np.zeros(capacity, np.float32)
+        self._bootstrap_offsets = np.zeros(capacity, np.uint8)
+        self._weights_versions = np.zeros(capacity, np.int64)
+        self._extents: deque[_Extent] = deque()
+        self._next_key = 0
+        self._next_row = 0
+        self._rng = rng
+
+    def __len__(self) -> int:
+        return self._next_key - self._first_key
+
+    @property
+    def _first_key(self) -> int:
+        return self._extents[0].first_key if self._extents else self._next_key
+
+    @property
+    def capacity(self) -> int:
+        return self._capacity
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the records and of what is kept a transition."""
+        columns = (
+            self._rows,
+            self._start_rows,
+            self._actions,
+            self._rewards,
+            self._discounts,
+            self._bootstrap_offsets,
+            self._weights_versions,
+        )
+        return sum(column.nbytes for column in columns)
+
+    def check(self, chunk: Chunk) -> None:
+        """Raise WireError where the chunk does not fit this table."""
+        num_rows, record_bytes = chunk.records.shape
+        tail = num_rows - len(chunk)
+        if record_bytes != self._rows.shape[1] or tail != self._window - 1:
+            raise WireError(
+                f"records of {record_bytes} bytes, {tail} more than transitions, where "
+                f"{self._rows.shape[1]} and {self._window - 1} are due: another arena or agent?"
+            )
+        if int(chunk.bootstrap_offsets.max()) > tail:
+            raise WireError("a bootstrap offset points behind the chunk's records")
+        if len(chunk) > self._capacity:
+            raise WireError(f"{len(chunk)} transitions exceed the capacity {self._capacity}")
+
+    def insert(self, chunk: Chunk) -> None:
+        """Append the chunk's transitions; the oldest chunks make room."""
+        self.check(chunk)
+        length, num_rows = len(chunk), len(chunk.records)
+        first_row = self._make_room(length, num_rows)
+        self._rows[first_row : first_row + num_rows] = chunk.records
+        slots = (self._next_key + np.arange(length)) % self._capacity
+        self._start_rows[slots] = first_row + np.arange(length)
+        self._actions[slots] = chunk.actions
+        self._rewards[slots] = chunk.rewards
+        self._discounts[slots] = chunk.discounts
+        self._bootstrap_offsets[slots] = chunk.bootstrap_offsets
+        self._weights_versions[slots] = chunk.weights_version
+        self._extents.append(_Extent(self._next_key, length, first_row, num_rows))
+        self._next_key += length
+        self._next_row = first_row + num_rows
+
+    def sample(self, size: int) -> Samples:
+        """`size` transitions, each as likely as any other; ValueError when the table is empty."""
+        num_transitions = len(self)
+        if num_transitions == 0:
+            raise ValueError("cannot sample from an empty table")
+        keys = self._first_key + self._rng.integers(0, num_transitions, size)
+        slots = keys % self._capacity
+        return Samples(
+            keys=keys,
+            probabilities=np.full(size, 1.0 / num_transitions),
+            table_size=num_transitions,
+            records=self._windows[self._start_rows[slots]],
+            actions=self._actions[slots],
+            rewards=self._rewards[slots],
+            discounts=self._discounts[slots],
+            bootstrap_offsets=self._bootstrap_offsets[slots],
+            weights_versions=self._weights_versions[slots],
+        )
+
+    def _make_room(self, num_transitions: int, num_rows: int) -> int:
+        """Evict until both fit; the first of `num_rows` free consecutive rows."""
+        while len(self) + num_transitions > self._capacity:
+            self._extents.popleft()
+        first_row = self._next_row
+        if first_row + num_rows > len(self._rows):
+            # The rows up to the end stay unused this time round.
+            self._evict_rows(first_row, len(self._rows))
+            first_row = 0
+        self._evict_rows(first_row, first_row + num_rows)
+        return first_row
+
+    def _evict_rows(self, start: int, stop: int) -> None:
+        # The oldest chunk is the next one ahead in the ring, so evicting in order frees them.
+        while self._extents and start <= self._extents[0].first_row < stop:
+            self._extents.popleft()
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError where one of the module's invariants does not hold."""
+        key = self._first_key
+        taken = np.zeros(len(self._rows), bool)
+        for extent in self._extents:
+            if extent.first_key != key:
+                raise AssertionError(f"key {extent.first_key} follows where {key} is due")
+            key += extent.num_transitions
+            rows = slice(extent.first_row, extent.first_row + extent.num_rows)
+            if taken[rows].any():
+                raise AssertionError("two chunks share a row")
+            taken[rows] = True
+        if key != self._next_key or len(self) > self._capacity:
+            raise AssertionError("keys are not the newest of all inserted, or exceed the capacity")
