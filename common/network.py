@@ -115,7 +115,7 @@ class QNetwork(nn.Module):
         White is 1: dividing the first kernel by 255 is the same as dividing the pictures, which
         stay exact integers, also in bfloat16.
         """
-        operands = dict(self.named_parameters())
+        operands: Operands = dict(self.named_parameters())
         operands["conv1.weight"] = operands["conv1.weight"] / _WHITE
         for name, parameter in operands.items():
             if not name.startswith(_OUTPUTS):

@@ -4,6 +4,7 @@ Invariants: SIGTERM and SIGINT set one StopSignal; errors on purpose end the pro
 line and exit code 1; bugs of ours crash with a traceback.
 """
 
+import ctypes
 import logging
 import os
 import re
@@ -27,6 +28,8 @@ from common.transport import Publisher, Session
 from common.wire import encode
 
 ENDPOINT_FILE = "endpoint"
+DIE_WITH_PARENT = "MRCDRL_DIE_WITH_PARENT"  # set in the environment by who starts services
+_PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
@@ -59,6 +62,8 @@ class StopSignal:
 def run_main(main: Callable[[], int | None]) -> int:
     """Run a command; the exit code. MrcdrlError becomes one line on stderr."""
     logging.basicConfig(level=logging.INFO, format=_LOG_FORMAT, stream=sys.stderr)
+    if os.environ.get(DIE_WITH_PARENT) and sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     try:
         return main() or 0
     except MrcdrlError as error:

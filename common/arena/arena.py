@@ -34,6 +34,8 @@ class Arena:
 
         Raises ConfigError when robots or targets do not fit.
         """
+        if max_collisions is not None and max_collisions < 1:
+            raise ValueError(f"max_collisions {max_collisions} would end episodes unplayed")
         self._config = config
         self._rng = rng
         self._max_collisions = config.max_collisions if max_collisions is None else max_collisions
@@ -56,7 +58,10 @@ class Arena:
         return Scene(self._world.robots, self._targets.copy())
 
     def reset(self, start: Start | None = None) -> TimeStep:
-        """Begins an episode, at random or at the given start."""
+        """Begins an episode, at random or at the given start.
+
+        Raises ValueError for a start with other shapes, or robots that overlap.
+        """
         start = self._random_start() if start is None else start
         shape = (self._config.num_robots, 3)
         if start.robots.shape != shape or start.targets.shape != (shape[0], 2):
@@ -64,6 +69,9 @@ class Arena:
                 f"start has robots {start.robots.shape} and targets {start.targets.shape}; "
                 f"this arena has {shape[0]} of each"
             )
+        if not np.isfinite(start.targets).all():
+            raise ValueError(f"start has targets {start.targets.tolist()}")
+        self._running = False
         self._world.place(start.robots)
         self._targets = start.targets.copy()
         self._running = True

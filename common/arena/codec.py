@@ -108,6 +108,8 @@ def _pictures(
     shape = (*records.shape[:-1], view_px, view_px)
     if out is None:
         return np.empty(shape, np.uint8)
-    if out.dtype != np.uint8 or out.shape != shape or not out.flags.c_contiguous:
-        raise ValueError(f"out is {out.dtype} {out.shape}, not C-contiguous uint8 {shape}")
+    if out.dtype != np.uint8 or out.shape != shape or not out.flags.carray:
+        raise ValueError(
+            f"out is {out.dtype} {out.shape}, not C-contiguous writeable uint8 {shape}"
+        )
     return out

@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 import pymunk
 
+from common.arena.layout import reachable_px
 from common.arena.scene import STRAIGHT
 from common.config import ArenaConfig
 from common.trajectory import BoolArray, Float64Array, UInt8Array
@@ -25,7 +26,7 @@ class World:
     """K robots between four walls (paper section 3)."""
 
     def __init__(self, config: ArenaConfig, robots: Float64Array) -> None:
-        """robots: poses [K, 3] that neither overlap nor touch a wall from beyond."""
+        """robots: poses [K, 3]; raises ValueError as place does."""
         self._config = config
         self._turn_rad = math.radians(config.turn_deg)
         radius = config.robot_radius_px
@@ -50,8 +51,19 @@ class World:
         return np.array(self._poses, np.float64)
 
     def place(self, robots: Float64Array) -> None:
-        """Puts the robots at the poses [K, 3] and forgets their collisions."""
+        """Puts the robots at the poses [K, 3] and forgets their collisions.
+
+        Raises ValueError when one overlaps another or a wall.
+        """
+        low, high = reachable_px(self._config)
         self._poses: list[Pose] = [(x, y, heading) for x, y, heading in robots.tolist()]
+        for i, pose in enumerate(self._poses):
+            if not (low <= min(pose[:2]) and max(pose[:2]) <= high and math.isfinite(pose[2])):
+                raise ValueError(f"robot {i} at {pose} is not between the walls")
+            self._put(i, pose)
+        for i, shape in enumerate(self._shapes):
+            if self._space.shape_query(shape):
+                raise ValueError(f"robot {i} at {self._poses[i]} overlaps another")
         self._back_off = [0] * len(self._poses)
 
     def move(self, actions: UInt8Array) -> BoolArray:

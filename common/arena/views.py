@@ -146,7 +146,7 @@ def _blend(value, grey, share):  # type: ignore[no-untyped-def]
 def _box(view, x0, x1, y0, y1, grey):  # type: ignore[no-untyped-def]
     """Paints the upright rectangle [x0, x1] x [y0, y1]."""
     size = view.shape[0]
-    if not (x1 > 0 and x0 < size and y1 > 0 and y0 < size and x1 - x0 < 1e9):
+    if not (x1 > 0 and x0 < size and y1 > 0 and y0 < size):
         return
     x0, x1 = max(x0, 0.0), min(x1, np.float64(size))
     y0, y1 = max(y0, 0.0), min(y1, np.float64(size))

@@ -144,7 +144,7 @@ class Learner:
                     moment: moments[f"{name}:{moment}"] for moment in self._moments
                 }
         self.learner_step = state.learner_step
-        self.rng = rng
+        self.rng.bit_generator.state = rng.bit_generator.state
 
     def _read_moments(self, payload: bytes) -> dict[str, Tensor]:
         """The optimiser's tensors, each on its device; {} before the first step."""

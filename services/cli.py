@@ -1,0 +1,42 @@
+"""`mrcdrl …`: every command under one name; each is imported only when it is called."""
+
+import importlib
+import sys
+
+from common.process import run_main
+
+_COMMANDS = {
+    "train": ("services.train.__main__", "train on this machine: all processes, one command"),
+    "evaluate": ("services.evaluator.evaluate", "the paper's test for weights or a controller"),
+    "render": ("services.evaluator.render", "a film of evaluation episodes"),
+    "report": ("services.evaluator.report", "the pictures and the film of a run"),
+    "config": ("services.configure", "print the resolved configuration"),
+    "replay": ("services.replay.__main__", "serve the replay table of a run"),
+    "actor": ("services.actor.__main__", "collect for a run that is up"),
+    "learner": ("services.learner.__main__", "learn for a run that is up"),
+    "evaluator": ("services.evaluator.__main__", "judge the live weights of a run that is up"),
+}
+
+
+def main() -> int:
+    """Dispatch to a command; the exit code."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_usage())
+        return 0 if arguments else 2
+    name = arguments[0]
+    if name not in _COMMANDS:
+        sys.stderr.write(f"mrcdrl: no command {name!r}; there are {', '.join(_COMMANDS)}\n")
+        return 2
+    command = importlib.import_module(_COMMANDS[name][0])
+    return run_main(lambda: command.main(arguments[1:]))
+
+
+def _usage() -> str:
+    lines = [f"  {name:<10} {text}" for name, (_, text) in _COMMANDS.items()]
+    head = "usage: mrcdrl COMMAND …   (mrcdrl COMMAND --help for its flags)"
+    return "\n".join([head, "", *lines])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""`mrcdrl evaluate`: the paper's test (section 5.3, Table 2) for weights or a controller."""
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+from rich.console import Console
+from rich.progress import Progress
+
+from common.arena import test_starts
+from common.trajectory import Evaluation
+from services.evaluator.score import evaluation
+from services.evaluator.subject import Subject, subject, subject_parser
+from services.evaluator.trial import play
+
+
+def main(argv: Sequence[str]) -> int:
+    """Evaluate and print; the exit code."""
+    parser = subject_parser("evaluate", "The paper's test: one collision fails, epsilon 0.01.")
+    parser.add_argument("--episodes", type=int, default=1100, help="starts; the paper's 1100")
+    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    arguments = parser.parse_args(argv)
+    if arguments.episodes < 1:
+        parser.error(f"--episodes {arguments.episodes}: at least 1")
+    judged = subject(arguments)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("episodes", total=arguments.episodes)
+        result = judge(
+            judged,
+            arguments.episodes,
+            arguments.seed,
+            lambda done: progress.update(task, completed=done),
+        )
+    if arguments.json:
+        print(json.dumps(dataclasses.asdict(result)))
+    else:
+        sys.stdout.write(table(result, judged))
+    return 0
+
+
+def judge(judged: Subject, episodes: int, seed: int, report: Callable[[int], None]) -> Evaluation:
+    """The evaluation; `report` is told how many episodes are done."""
+    began_s = time.monotonic()
+    starts = test_starts(judged.config.arena, episodes, seed)
+
+    def go_on(done: int) -> bool:
+        report(done)
+        return True
+
+    results = play(judged.config.arena, starts, judged.player(seed), go_on=go_on)
+    return evaluation(
+        results or [],
+        worker=judged.controller or "evaluate",
+        weights=judged.weights,
+        num_robots=judged.config.arena.num_robots,
+        seed=seed,
+        wall_s=time.monotonic() - began_s,
+    )
+
+
+def table(result: Evaluation, judged: Subject) -> str:
+    """The result for a reader."""
+    low, high = result.success_interval
+    who = (
+        f"controller {judged.controller}, which sees the true state"
+        if judged.controller
+        else f"weights of learner step {result.learner_step}, from pictures alone"
+    )
+    return f"""{who}
+{result.num_robots} robots, {result.episodes} episodes, epsilon {judged.config.evaluator.epsilon:g}
+  success    {result.success_rate:7.2%}   (95 % interval {low:.2%} to {high:.2%})
+  collision  {result.collision_rate:7.2%}
+  time-out   {result.timeout_rate:7.2%}
+  successes per 100: max {result.max_per_100:.0f}, average {result.mean_per_100:.2f}, \
+variance {result.variance_per_100:.2f}
+  frames to success: {result.mean_frames:.0f}
+"""

@@ -1,0 +1,27 @@
+"""Evaluation episodes as pictures: the arena beside what its robots see."""
+
+from collections.abc import Iterator, Sequence
+
+from common.arena import Scene, draw_arena, make_codec
+from common.config import ArenaConfig
+from common.trajectory import UInt8Array
+from services.dashboard.film import compose_frame
+from services.evaluator.trial import EpisodeResult
+
+_ARENA_PX = 600
+_HOLD_FRAMES = 20  # the last picture of an episode stays a moment
+
+
+def film_frames(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[UInt8Array]:
+    """Pictures uint8 BGR [H, W, 3] of these episodes, one after the other."""
+    codec = make_codec(config)
+    for number, episode in enumerate(episodes, 1):
+        last = len(episode.robots) - 1
+        for frame, robots in enumerate(episode.robots):
+            scene = Scene(robots, episode.targets)
+            views = codec.decode(codec.encode(scene))
+            ending = f"   {episode.outcome.value}" if frame == last else ""
+            caption = f"episode {number} of {len(episodes)}   frame {frame}{ending}"
+            picture = compose_frame(draw_arena(scene, config, _ARENA_PX), views, caption)
+            for _ in range(_HOLD_FRAMES if frame == last else 1):
+                yield picture

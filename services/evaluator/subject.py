@@ -1,0 +1,104 @@
+"""What is to be judged, from a command line: weights or a controller, in which arena."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.arena import controller, make_codec
+from common.arguments import Parser, add_config_flags, overrides
+from common.config import Config, load_config
+from common.errors import CheckpointError, ConfigError
+from common.files import read_weights
+from common.network import network_from_bytes, precision
+from common.policy import Policy
+from common.trajectory import Weights
+from services.evaluator.trial import ControllerPlayer, Player, PolicyPlayer
+
+_RUN_CONFIG = "config.toml"
+_BEST = Path("checkpoints") / "best.safetensors"
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A policy or a controller, and the arena to judge it in."""
+
+    config: Config
+    policy: Policy | None
+    controller: str | None
+    weights: Weights  # of a controller: version 0 without parameters
+
+    def player(self, seed: int) -> Player:
+        """A fresh player, its exploration drawn from the seed."""
+        arena, rng = self.config.arena, np.random.default_rng(seed)
+        epsilon = self.config.evaluator.epsilon
+        if self.policy is not None:
+            return PolicyPlayer(arena, make_codec(arena), self.policy, epsilon, rng)
+        chosen = controller(self.controller or "", arena, rng)
+        return ControllerPlayer(chosen, epsilon, rng)
+
+
+def subject_parser(command: str, description: str) -> Parser:
+    """The flags that name a subject."""
+    parser = Parser(prog=f"mrcdrl {command}", description=description)
+    parser.add_argument("weights", nargs="?", type=Path, help="a .safetensors file, or a run")
+    parser.add_argument("--controller", help="random or greedy, instead of weights")
+    parser.add_argument("--robots", metavar="K", help="arena.num_robots")
+    parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
+    add_config_flags(parser)
+    return parser
+
+
+def subject(arguments: argparse.Namespace) -> Subject:
+    """What the flags name.
+
+    Raises ConfigError for flags that contradict each other, CheckpointError for weights that
+    cannot be read, are foreign, or do not fit the arena.
+    """
+    if (arguments.weights is None) == (arguments.controller is None):
+        raise ConfigError("give either weights or --controller")
+    given = overrides(arguments)
+    if arguments.robots is not None:
+        given["arena.num_robots"] = arguments.robots
+    if arguments.controller is not None:
+        config = load_config(arguments.config or "quick", given)
+        return Subject(config, None, arguments.controller, Weights(0, 0, 0, b""))
+    path = weights_path(arguments.weights)
+    config = load_config(arguments.config or _config_beside(path), given)
+    payload, manifest = read_weights(path)
+    network = network_from_bytes(payload, compute_dtype=precision(config.learner.precision))
+    if (network.stack, network.view_px) != (config.arena.stack, config.arena.view_px):
+        raise CheckpointError(
+            f"{path} sees {network.stack} pictures of {network.view_px} px, the arena gives "
+            f"{config.arena.stack} of {config.arena.view_px} px"
+        )
+    weights = Weights(
+        epoch=int(manifest.get("weights_epoch", 0)),
+        version=int(manifest.get("weights_version", 0)),
+        learner_step=int(manifest.get("learner_step", 0)),
+        payload=payload,
+    )
+    return Subject(config, Policy(network), None, weights)
+
+
+def weights_path(path: Path) -> Path:
+    """The file itself, or of a run's folder the best weights, else the newest checkpoint's.
+
+    Raises CheckpointError where there is none.
+    """
+    if not path.is_dir():
+        return path
+    found = [path / _BEST, *sorted(path.glob("checkpoints/step_*/model.safetensors"))[::-1]]
+    for candidate in (*found, path / "model.safetensors"):
+        if candidate.is_file():
+            return candidate
+    raise CheckpointError(f"{path} holds no weights")
+
+
+def _config_beside(path: Path) -> str:
+    """The configuration of the run that the weights lie in; else the preset `quick`."""
+    for folder in path.resolve().parents[:3]:
+        if (folder / _RUN_CONFIG).is_file():
+            return str(folder / _RUN_CONFIG)
+    return "quick"

@@ -1,0 +1,165 @@
+"""`mrcdrl train`: one command from the first frame to a judged policy, all on this machine."""
+
+import logging
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+
+from common.arguments import Parser, add_config_flags, overrides
+from common.config import Config, TransportConfig, load_config
+from common.keys import Keys, check_name
+from common.process import StopSignal, available_cores, run_main
+from common.transport import Session, free_endpoint
+from services.dashboard.recorder import Recorder
+from services.dashboard.screen import plain_line, screen
+from services.dashboard.state import RunState
+from services.dashboard.stopping import StoppingRule
+from services.train.fleet import Fleet
+from services.train.follower import Follower
+from services.train.rundir import CONFIG_FILE, RunDirectory, default_name
+
+_LOG = logging.getLogger("train")
+_TICK_S = 0.25
+_PLAIN_PERIOD_S = 10.0
+_PICTURES_S = 300.0
+
+
+def main(argv: Sequence[str]) -> int:
+    """Train; the exit code."""
+    with open_run(argv) as run:
+        stop = StopSignal().listen()
+        endpoint = (run.config.transport.listen or (free_endpoint(),))[0]
+        fleet = Fleet(run.logs)
+        try:
+            with Recorder(run.path, run.config) as recorder:
+                reason = supervise(run, fleet, recorder, endpoint, stop)
+        finally:
+            fleet.stop()
+        _LOG.info("%s: drawing what the run leaves", reason)
+        draw(run.path)
+    _LOG.info("the run is in %s: summary.json, training.png, evaluation.mp4", run.path)
+    return 0
+
+
+def open_run(argv: Sequence[str]) -> RunDirectory:
+    """The run that the command line asks for, its folder made or taken up again."""
+    parser = Parser(prog="mrcdrl train", description="Train on this machine, all processes.")
+    parser.add_argument("--config", default="quick", help="a preset or a TOML file")
+    parser.add_argument("--robots", metavar="K", help="arena.num_robots")
+    parser.add_argument("--minutes", metavar="M", help="run.minutes")
+    parser.add_argument("--learner-steps", metavar="N", help="run.learner_steps")
+    parser.add_argument("--actors", metavar="N", help="run.actors")
+    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
+    parser.add_argument("--name", help="the run's name; by default from preset, robots and time")
+    parser.add_argument("--resume", metavar="RUN", help="go on with this run where it was")
+    add_config_flags(parser)
+    arguments = parser.parse_args(argv)
+    given = overrides(arguments)
+    for flag, field in {
+        "robots": "arena.num_robots",
+        "minutes": "run.minutes",
+        "learner_steps": "run.learner_steps",
+        "actors": "run.actors",
+    }.items():
+        if getattr(arguments, flag) is not None:
+            given[field] = getattr(arguments, flag)
+    if arguments.resume:
+        name = check_name(Path(arguments.resume).name, "run name")
+        return RunDirectory.resume(arguments.run_dir / name, given)
+    config = load_config(arguments.config, given)
+    name = arguments.name or default_name(arguments.config, config.arena.num_robots)
+    return RunDirectory.create(arguments.run_dir / check_name(name, "run name"), config)
+
+
+def supervise(
+    run: RunDirectory, fleet: Fleet, recorder: Recorder, endpoint: str, stop: StopSignal
+) -> str:
+    """Run all services until stopped or the rule says so; the reason."""
+    config, keys = run.config, Keys(run.path.name)
+    state, rule = RunState(config), StoppingRule(config.run)
+    fleet.start("replay", "replay-0", replay_arguments(run, endpoint))
+    with Session(TransportConfig(connect=(endpoint,))) as session:
+        run.note_endpoint(endpoint)
+        follower = Follower(session, keys, state, recorder, rule)
+        for role, count in {
+            "learner": 1,
+            "actor": config.run.actors or default_actors(),
+            "evaluator": config.run.evaluators,
+        }.items():
+            for index in range(count):
+                worker = f"{role}-{index}"
+                fleet.start(role, worker, join_arguments(run, endpoint, worker))
+        with display(state, config, run.path.name, lambda: follower.now) as show:
+            reason = None
+            while reason is None:
+                follower.listen(_TICK_S)
+                for line in fleet.warnings():
+                    state.observe_log(line)
+                show()
+                reason = fleet.watch() or follower.stop_reason()
+                if stop.is_set():
+                    reason = "stopped by hand"
+        _LOG.info("stopping: %s", reason)
+        fleet.stop()
+        follower.listen(_TICK_S)
+    recorder.write_summary(state, follower.now, reason)
+    return reason
+
+
+def replay_arguments(run: RunDirectory, endpoint: str) -> list[str]:
+    config_path = str(run.path / CONFIG_FILE)
+    return ["--run", run.path.name, "--config", config_path, "--listen", endpoint]
+
+
+def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
+    run_dir = str(run.path.parent)
+    name = run.path.name
+    return ["--run", name, "--connect", endpoint, "--run-dir", run_dir, "--id", worker]
+
+
+def default_actors() -> int:
+    """Half the cores, the other half is the learner's; at least 1."""
+    return max(1, available_cores() // 2)
+
+
+@contextmanager
+def display(
+    state: RunState, config: Config, name: str, clock: Callable[[], float]
+) -> Iterator[Callable[[], None]]:
+    """A function that shows the state: a live screen, or plain lines where there is no terminal."""
+    console = Console()
+    if not console.is_terminal:
+        due_s = [0.0]
+
+        def print_line() -> None:
+            if clock() >= due_s[0]:
+                due_s[0] = clock() + _PLAIN_PERIOD_S
+                console.print(plain_line(state, clock()), soft_wrap=True, highlight=False)
+
+        yield print_line
+        return
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        yield lambda: live.update(screen(state, config, clock(), name), refresh=True)
+
+
+def draw(run_dir: Path) -> None:
+    """The pictures and the film of a run, in a process of its own; the run is whole without."""
+    command = [sys.executable, "-m", "services.cli", "report", str(run_dir)]
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=_PICTURES_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        _LOG.warning("drawing took over %g s and was given up", _PICTURES_S)
+        return
+    if result.returncode:
+        _LOG.warning("not all was drawn: %s", (result.stderr.splitlines() or ["no reason"])[-1])
+
+
+if __name__ == "__main__":
+    sys.exit(run_main(lambda: main(sys.argv[1:])))

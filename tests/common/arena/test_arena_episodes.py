@@ -1,0 +1,187 @@
+"""Whole episodes: outcomes, discounts, refused misuse, and the same play from the same seed."""
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from common.arena import (
+    Arena,
+    CountingArena,
+    Scene,
+    Start,
+    controller,
+    greedy_actions,
+    make_arena,
+    make_codec,
+    starts,
+)
+from common.config import ArenaConfig
+from common.errors import ConfigError
+from common.trajectory import Outcome, StepType
+
+GO = np.ones(2, np.uint8)
+TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])
+
+
+def start(*robots: tuple[float, float, float]) -> Start:
+    return Start(np.array(robots), TARGETS)
+
+
+def arena(max_collisions: int | None = None, **settings: object) -> Arena:
+    config = ArenaConfig.model_validate(settings)
+    return Arena(config, np.random.default_rng(0), max_collisions=max_collisions)
+
+
+def test_an_episode_from_first_to_success() -> None:
+    game = arena()
+    first = game.reset(start((140, 300, 0), (440, 300, np.pi)))
+    assert first.first
+    assert (first.rewards.tolist(), first.discount, first.outcome) == ([0, 0], 1.0, None)
+    for frame in range(1, 7):  # 140 -> 155 is 20 px away, which is not below delta
+        step = game.step(GO)
+        assert (step.step_type, step.discount, step.outcome) == (StepType.MID, 1.0, None)
+        assert game.frame == frame
+    last = game.step(GO)
+    assert last.last
+    assert (last.outcome, last.discount, last.rewards.tolist()) == (Outcome.SUCCESS, 0, [200, 200])
+    with pytest.raises(ValueError, match="reset first"):
+        game.step(GO)
+
+
+@pytest.mark.parametrize(
+    ("max_collisions", "frames", "collisions"), [(None, 3, 6), (1, 1, 2), (3, 2, 4)]
+)
+def test_collisions_of_all_robots_end_an_episode(
+    max_collisions: int | None, frames: int, collisions: int
+) -> None:
+    game = arena(max_collisions)
+    game.reset(start((200, 500, 0), (250, 500, np.pi)))
+    step = game.step(GO)
+    while not step.last:
+        assert step.rewards.tolist() == [-5, -5]
+        assert step.discount == 1.0
+        step = game.step(GO)
+    assert (game.frame, game.collisions) == (frames, collisions)
+    assert (step.outcome, step.discount, step.collided.all()) == (Outcome.COLLISION, 0, True)
+
+
+def test_a_time_out_is_truncated_not_terminated() -> None:
+    game = arena(max_frames=4)
+    game.reset(start((100, 100, 0), (100, 500, 0)))
+    steps = [game.step(GO) for _ in range(4)]
+    assert [s.step_type for s in steps] == [StepType.MID] * 3 + [StepType.LAST]
+    assert (steps[-1].outcome, steps[-1].discount) == (Outcome.TIMEOUT, 1.0)
+    assert game.reset().first
+    assert (game.frame, game.collisions) == (0, 0)
+
+
+def test_failure_in_the_last_frame_is_failure() -> None:
+    game = arena(1, max_frames=1)
+    game.reset(start((200, 500, 0), (250, 500, np.pi)))
+    assert game.step(GO).outcome is Outcome.COLLISION
+
+
+def test_records_are_the_codecs() -> None:
+    game = arena()
+    codec = make_codec(ArenaConfig())
+    np.testing.assert_array_equal(game.reset().records, codec.encode(game.scene))
+    np.testing.assert_array_equal(game.step(GO).records, codec.encode(game.scene))
+
+
+def test_random_targets_change_from_episode_to_episode() -> None:
+    game = arena(target_layout="random")
+    game.reset()
+    before = game.scene.targets
+    game.reset()
+    assert not np.array_equal(before, game.scene.targets)
+
+
+@pytest.mark.parametrize(
+    "actions", [[1], [1, 1, 1], [[1, 1]], [0, 3], [-1, 0], [0.0, 1.0], [True, False], []]
+)
+def test_bad_actions_are_refused(actions: list[object]) -> None:
+    for game in (arena(), counting()):
+        game.reset()
+        with pytest.raises(ValueError, match="actions"):
+            game.step(np.array(actions))
+
+
+def counting() -> CountingArena:
+    return CountingArena(ArenaConfig(kind="counting", codec="frames"))
+
+
+def test_misuse_is_refused() -> None:
+    for game in (arena(), counting()):
+        with pytest.raises(ValueError, match="reset first"):
+            game.step(GO)
+    with pytest.raises(ValueError, match="this arena has 2"):
+        arena().reset(Start(np.zeros((3, 3)), np.zeros((3, 2))))
+    with pytest.raises(ValueError, match="targets"):
+        arena().reset(Start(start((100, 100, 0), (200, 200, 0)).robots, TARGETS * np.nan))
+    with pytest.raises(ValueError, match="overlaps"):
+        arena().reset(start((100, 100, 0), (120, 100, 0)))
+    with pytest.raises(ValueError, match="max_collisions 0"):
+        arena(0)
+    with pytest.raises(ConfigError, match="10 robots"):
+        arena(num_robots=10, size_px=200, success_radius_px=24)
+
+
+def test_make_arena_goes_by_kind() -> None:
+    rng = np.random.default_rng(0)
+    assert isinstance(make_arena(ArenaConfig(), rng, max_collisions=1), Arena)
+    config = ArenaConfig(kind="counting", codec="frames")
+    assert isinstance(make_arena(config, rng, identity=3), CountingArena)
+
+
+def fingerprint() -> str:
+    """A hash of what a seed determines; the same in another process."""
+    config = ArenaConfig(num_robots=4, target_layout="random")
+    rng = np.random.default_rng(7)
+    game = Arena(config, rng)
+    codec = make_codec(config)
+    play = controller("random", config, rng)
+    total = hashlib.sha256()
+    step = game.reset()
+    for _ in range(300):
+        total.update(step.records.tobytes() + step.rewards.tobytes() + step.collided.tobytes())
+        total.update(codec.decode(step.records).tobytes())
+        step = game.reset() if step.last else game.step(play(game.scene))
+    for begin in starts.test_starts(config, 20, seed=1):
+        total.update(begin.robots.tobytes() + begin.targets.tobytes())
+    return total.hexdigest()
+
+
+def test_a_seed_gives_the_same_play_in_another_process() -> None:
+    code = (
+        "import importlib.util as u; "
+        f"s = u.spec_from_file_location('episodes', {__file__!r}); "
+        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.fingerprint())"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert other.stdout.strip() == fingerprint()
+
+
+def test_greedy_goes_to_free_targets_and_mostly_succeeds() -> None:
+    config = ArenaConfig()
+    robots = np.array([[170.0, 100, 0], [180.0, 500, 0]])
+    nearer = greedy_actions(Scene(robots, TARGETS), config)
+    assert nearer.tolist() == [2, 0]  # one to (175, 300), below it; one to (425, 300), above
+    game = Arena(config, np.random.default_rng(0), max_collisions=1)
+    play = controller("greedy", config, np.random.default_rng(0))
+    outcomes = []
+    for begin in starts.test_starts(config, 40, seed=0):
+        step = game.reset(begin)
+        while not step.last:
+            step = game.step(play(game.scene))
+        outcomes.append(step.outcome)
+    assert outcomes.count(Outcome.SUCCESS) >= 30
+
+
+def test_an_unknown_controller_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'clever'"):
+        controller("clever", ArenaConfig(), np.random.default_rng(0))

@@ -1,0 +1,207 @@
+"""The collision rule as a table, and what must hold of any play."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.arena import LEFT, RIGHT, STRAIGHT, Scene, World, layout_symmetries, training_start
+from common.arena.layout import reachable_px
+from common.config import ArenaConfig
+from common.trajectory import BoolArray, Float64Array
+
+TURN = math.radians(23)
+EAST, SOUTH, WEST, NORTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
+GO = STRAIGHT
+
+
+def world(*robots: tuple[float, float, float], **settings: float) -> World:
+    config = ArenaConfig.model_validate({"num_robots": len(robots), **settings})
+    return World(config, np.array(robots))
+
+
+def actions(*values: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
+    return np.array(values, np.uint8)
+
+
+@pytest.mark.parametrize(("action", "heading"), [(LEFT, -TURN), (STRAIGHT, 0.0), (RIGHT, TURN)])
+def test_a_robot_turns_and_then_moves(action: int, heading: float) -> None:
+    arena = world((300, 300, EAST))
+    assert not arena.move(actions(action)).any()
+    expected = (300 + 2.5 * math.cos(heading), 300 + 2.5 * math.sin(heading), heading)
+    np.testing.assert_allclose(arena.robots[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("robots", "collided"),
+    [
+        # walls: the inner face is at 12 px, so a centre may be at 37 px
+        ([(39.5, 300, WEST)], [False]),
+        ([(39.4, 300, WEST)], [True]),
+        ([(560.5, 300, EAST)], [False]),
+        ([(560.6, 300, EAST)], [True]),
+        ([(300, 39.5, NORTH)], [False]),
+        ([(300, 39.4, NORTH)], [True]),
+        ([(300, 560.6, SOUTH)], [True]),
+        # two robots: centres may be 50 px apart
+        ([(200, 300, EAST), (255, 300, WEST)], [False, False]),
+        ([(200, 300, EAST), (254.9, 300, WEST)], [True, True]),
+        ([(200, 300, EAST), (250, 300, EAST)], [False, False]),
+        ([(200, 300, EAST), (250, 300, SOUTH)], [True, True]),
+        # one that flees is not caught, though its old place would be
+        ([(200, 300, WEST), (250, 300, WEST)], [False, False]),
+        # a chain: the wall stops the first, whose old place stops the second, and so on
+        ([(37, 300, WEST), (87, 300, WEST), (137, 300, WEST)], [True, True, True]),
+        ([(37, 300, WEST), (89.6, 300, WEST), (137, 300, EAST)], [True, False, False]),
+        ([(37, 300, WEST), (89.4, 300, WEST), (139.5, 300, WEST)], [True, True, True]),
+    ],
+)
+def test_collisions(robots: list[tuple[float, float, float]], collided: list[bool]) -> None:
+    arena = world(*robots)
+    assert arena.move(actions(*[GO] * len(robots))).tolist() == collided
+    for robot, before, blocked in zip(arena.robots, robots, collided, strict=True):
+        assert (robot[:2].tolist() == list(before[:2])) is blocked
+
+
+def test_a_blocked_robot_keeps_its_turn() -> None:
+    arena = world((37, 300, WEST))
+    assert arena.move(actions(RIGHT)).all()
+    np.testing.assert_allclose(arena.robots[0], (37, 300, TURN - math.pi))
+
+
+def test_back_off_drives_backwards_and_is_neither_steered_nor_punished() -> None:
+    arena = world((38, 300, WEST), back_off_frames=2)
+    assert arena.move(actions(STRAIGHT)).all()
+    assert not arena.move(actions(LEFT)).any()
+    assert not arena.move(actions(LEFT)).any()
+    np.testing.assert_allclose(arena.robots[0], (43, 300, math.pi))
+    assert not arena.move(actions(STRAIGHT)).any()
+    np.testing.assert_allclose(arena.robots[0, 0], 40.5)
+
+
+def test_a_robot_blocked_while_backing_off_does_not_collide() -> None:
+    arena = world((562, 300, EAST), (511.5, 300, WEST), back_off_frames=1)
+    assert arena.move(actions(GO, GO)).tolist() == [True, False]
+    still = world((562, 300, EAST), (512, 300, NORTH), (462, 300, NORTH), back_off_frames=3)
+    assert still.move(actions(GO, GO, GO)).tolist() == [True, True, False]
+    before = still.robots[0]
+    assert not still.move(actions(GO, GO, GO))[0]
+    np.testing.assert_array_equal(still.robots[0], before)
+
+
+@pytest.mark.parametrize(
+    "robots",
+    [
+        [(36.9, 300, 0)],
+        [(300, 563.1, 0)],
+        [(-1000, 300, 0)],
+        [(300, math.nan, 0)],
+        [(300, 300, math.inf)],
+        [(300, 300, 0), (349, 300, 0)],
+    ],
+)
+def test_impossible_places_are_refused(robots: list[tuple[float, float, float]]) -> None:
+    with pytest.raises(ValueError, match="robot"):
+        world(*robots)
+
+
+def crowd(seed: int, **settings: object) -> tuple[ArenaConfig, Float64Array, np.random.Generator]:
+    """A full arena, in which there is no lack of collisions."""
+    config = ArenaConfig.model_validate({"num_robots": 5, "size_px": 270, **settings})
+    rng = np.random.default_rng(seed)
+    return config, training_start(config, np.zeros((5, 2)), rng).robots, rng
+
+
+def clear(config: ArenaConfig, robots: Float64Array) -> bool:
+    low, high = reachable_px(config)
+    first, second = np.triu_indices(len(robots), 1)
+    gaps = np.hypot(*(robots[first, :2] - robots[second, :2]).T)
+    places = robots[:, :2]
+    return bool(
+        (gaps >= 2 * config.robot_radius_px - 1e-9).all()
+        and (places >= low - 1e-9).all()
+        and (places <= high + 1e-9).all()
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    back_off=st.sampled_from([0, 3]),
+    step=st.sampled_from([2.5, 20.0, 80.0]),
+)
+def test_robots_never_overlap_nor_leave(seed: int, back_off: int, step: float) -> None:
+    config, robots, rng = crowd(seed, back_off_frames=back_off, step_px=step)
+    arena = World(config, robots)
+    for _ in range(60):
+        arena.move(rng.integers(0, 3, 5, dtype=np.uint8))
+        assert clear(config, arena.robots)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), order=st.permutations(range(5)))
+def test_the_order_of_robots_does_not_matter(seed: int, order: list[int]) -> None:
+    config, robots, rng = crowd(seed)
+    one, other = World(config, robots), World(config, robots[order])
+    for _ in range(60):
+        moves = rng.integers(0, 3, 5, dtype=np.uint8)
+        collided = one.move(moves)
+        np.testing.assert_array_equal(other.move(moves[order]), collided[order])
+        np.testing.assert_array_equal(other.robots, one.robots[order])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), which=st.integers(0, 7))
+def test_a_mapped_world_gives_the_mapped_outcome(seed: int, which: int) -> None:
+    config, robots, rng = crowd(seed, target_layout="random")
+    symmetry = layout_symmetries(config)[which]
+
+    def mapped(poses: Float64Array) -> Float64Array:
+        return symmetry.apply_to_scene(Scene(poses, np.zeros((5, 2))), config.size_px).robots
+
+    one, other = World(config, robots), World(config, mapped(robots))
+    for _ in range(60):
+        moves = rng.integers(0, 3, 5, dtype=np.uint8)
+        collided = one.move(moves)
+        np.testing.assert_array_equal(other.move(symmetry.apply_to_actions(moves)), collided)
+        expected = mapped(one.robots)
+        np.testing.assert_allclose(other.robots[:, :2], expected[:, :2], atol=1e-7)
+        turned = np.exp(1j * (other.robots[:, 2] - expected[:, 2]))
+        np.testing.assert_allclose(turned, 1, atol=1e-9)
+
+
+def by_the_rule(
+    config: ArenaConfig, robots: Float64Array, moves: Float64Array
+) -> tuple[Float64Array, BoolArray]:
+    """The rule written down once more, without pymunk."""
+    turned = robots.copy()
+    turned[:, 2] += (moves - 1) * math.radians(config.turn_deg)
+    ways = np.stack([np.cos(turned[:, 2]), np.sin(turned[:, 2])], axis=1)
+    after = turned.copy()
+    after[:, :2] += config.step_px * ways
+    low, high = reachable_px(config)
+    blocked = np.zeros(len(robots), np.bool_)
+    while True:
+        places = np.where(blocked[:, None], turned, after)[:, :2]
+        gaps = np.linalg.norm(places[:, None] - places[None], axis=2)
+        np.fill_diagonal(gaps, np.inf)
+        hit = (gaps < 2 * config.robot_radius_px).any(axis=1)
+        hit |= ((places < low) | (places > high)).any(axis=1)
+        if not (hit & ~blocked).any():
+            return np.where(blocked[:, None], turned, after), blocked
+        blocked |= hit & ~blocked
+
+
+def test_pymunk_finds_what_the_rule_says() -> None:
+    config, robots, rng = crowd(1)
+    arena = World(config, robots)
+    seen = 0
+    for _ in range(1000):
+        moves = rng.integers(0, 3, 5, dtype=np.uint8)
+        expected, blocked = by_the_rule(config, arena.robots, moves.astype(np.float64))
+        np.testing.assert_array_equal(arena.move(moves), blocked)
+        np.testing.assert_allclose(arena.robots[:, :2], expected[:, :2], atol=1e-9)
+        seen += int(blocked.sum())
+    assert seen > 100

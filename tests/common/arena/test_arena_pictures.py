@@ -1,0 +1,200 @@
+"""Pictures: the analytic renderer against OpenCV, symmetries, and what any bytes give."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.arena import Scene, Symmetry, draw_arena, literal_views, make_codec, starts
+from common.config import ArenaConfig
+from common.trajectory import UInt8Array
+
+EVERY = [Symmetry(*flags) for flags in product((False, True), repeat=3)]
+
+
+def scenes(config: ArenaConfig, num: int, seed: int = 0) -> list[Scene]:
+    return [Scene(s.robots, s.targets) for s in starts.test_starts(config, num, seed)]
+
+
+def views(config: ArenaConfig, scene: Scene) -> UInt8Array:
+    codec = make_codec(config)
+    return codec.decode(codec.encode(scene))
+
+
+@pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
+@pytest.mark.parametrize("crop_px", [600, 800, 1200])
+def test_analytic_is_what_opencv_draws(crop_px: int, orientation: str) -> None:
+    config = ArenaConfig.model_validate(
+        {
+            "num_robots": 4,
+            "target_layout": "random",
+            "crop_px": crop_px,
+            "orientation": orientation,
+        }
+    )
+    errors = [
+        views(config, scene).astype(int) - literal_views(scene, config)
+        for scene in scenes(config, 100)
+    ]
+    assert np.abs(errors).mean() < 0.25
+    assert abs(np.mean(errors)) < 0.1
+
+
+def test_a_picture_by_hand() -> None:
+    """One robot in the middle of its arena, heading east; a pixel is 10 px."""
+    config = ArenaConfig(num_robots=1, targets_px=((455, 305),), robot_radius_px=30)
+    view = views(config, Scene(np.array([[300.0, 300.0, 0.0]]), np.array([[455.0, 305.0]])))[0]
+    assert view[0].max() == 0
+    np.testing.assert_array_equal(view[1, 1:59], [15] * 58)  # 2 of 10 px of grey 76
+    np.testing.assert_array_equal(view[1:59, 58], [15] * 58)
+    np.testing.assert_array_equal(view[29:32, 44:47], np.full((3, 3), 29))
+    assert view[28:33, 43:48].sum() == 9 * 29
+    np.testing.assert_array_equal(view[28, 28:32], [255] * 4)
+    # the heading's upper half: 1 of 10 px
+    np.testing.assert_array_equal(view[29, 28:33], [255, 255, 230, 230, 230])
+    assert view[27:33, 27:33].sum() == pytest.approx(255 * (np.pi * 9 - 3 * 0.2), rel=2e-3)
+
+
+def test_heading_up_puts_ahead_at_the_top() -> None:
+    config = ArenaConfig(num_robots=1, targets_px=((300, 400),), orientation="heading_up")
+    for heading, where in [(np.pi / 2, (20, 30)), (0.0, (30, 40)), (np.pi, (30, 20))]:
+        robots = np.array([[300.0, 300.0, heading]])
+        view = views(config, Scene(robots, np.array([[300.0, 400.0]])))[0]
+        assert view[where] == 29
+        assert (view == 29).sum() >= 1
+
+
+@pytest.mark.parametrize("symmetry", EVERY)
+def test_the_mapped_scene_gives_the_mapped_picture(symmetry: Symmetry) -> None:
+    config = ArenaConfig(num_robots=4, target_layout="random")
+    for scene in scenes(config, 40):
+        mapped = views(config, symmetry.apply_to_scene(scene, config.size_px)).astype(int)
+        gaps = np.abs(mapped - symmetry.apply_to_pictures(views(config, scene)))
+        assert gaps.mean() < 0.03
+        if not symmetry.transpose:
+            assert gaps.max() <= 1
+        else:  # discs are exact along x and sampled along y
+            assert np.quantile(gaps, 0.999) <= 3
+            assert gaps.max() <= 12
+
+
+@pytest.mark.parametrize("symmetry", EVERY)
+def test_heading_up_knows_mirrors_only(symmetry: Symmetry) -> None:
+    config = ArenaConfig(num_robots=4, target_layout="random", orientation="heading_up")
+    mirror = Symmetry(transpose=False, flip_x=symmetry.mirrors, flip_y=False)
+    for scene in scenes(config, 20):
+        mapped = views(config, symmetry.apply_to_scene(scene, config.size_px)).astype(int)
+        gaps = np.abs(mapped - mirror.apply_to_pictures(views(config, scene)))
+        assert gaps.max() <= 2
+
+
+def test_actions_are_swapped_by_mirrors_only() -> None:
+    actions = np.array([[0, 1, 2]], np.uint8)
+    for symmetry in EVERY:
+        expected = [[2, 1, 0]] if symmetry.mirrors else [[0, 1, 2]]
+        assert symmetry.apply_to_actions(actions).tolist() == expected
+    assert sum(s.mirrors for s in EVERY) == 4
+
+
+@pytest.mark.parametrize("renderer", ["analytic", "literal"])
+@pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
+def test_codecs_give_the_same_pixels(renderer: str, orientation: str) -> None:
+    base = {"num_robots": 3, "renderer": renderer, "orientation": orientation}
+    by_scene = make_codec(ArenaConfig.model_validate({**base, "codec": "scene"}))
+    by_frame = make_codec(ArenaConfig.model_validate({**base, "codec": "frames"}))
+    assert (by_scene.record_bytes, by_frame.record_bytes) == (60, 3600)
+    for scene in scenes(ArenaConfig(num_robots=3), 5):
+        one, other = (c.decode(c.encode(scene)) for c in (by_scene, by_frame))
+        np.testing.assert_array_equal(one, other)
+
+
+def test_literal_views_are_what_the_literal_codec_decodes() -> None:
+    config = ArenaConfig(num_robots=4, renderer="literal")
+    scene = scenes(config, 1)[0]
+    rounded = Scene(scene.robots.astype(np.float32).astype(np.float64), scene.targets)
+    np.testing.assert_array_equal(views(config, scene), literal_views(rounded, config))
+
+
+def test_records_are_the_scene_as_each_robot_lists_it() -> None:
+    config = ArenaConfig(num_robots=2)
+    codec = make_codec(config)
+    records = codec.encode(Scene(np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([[7.0, 8], [9, 10]])))
+    assert records.dtype == np.uint8
+    assert codec.record_bytes == 40
+    assert records.view("<f4").tolist() == [
+        [1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
+        [4, 5, 6, 1, 2, 3, 7, 8, 9, 10],
+    ]
+
+
+@pytest.mark.parametrize("kind", ["scene", "frames"])
+def test_decode_keeps_leading_axes_and_fills_out(kind: str) -> None:
+    config = ArenaConfig.model_validate({"codec": kind, "view_px": 24})
+    codec = make_codec(config)
+    records = codec.encode(scenes(config, 1)[0])
+    expected = codec.decode(records)
+    many = np.broadcast_to(records, (3, 5, *records.shape))  # read-only, and not contiguous
+    out = np.full((3, 5, 2, 24, 24), 9, np.uint8)
+    assert codec.decode(many, out) is out
+    np.testing.assert_array_equal(out, np.broadcast_to(expected, out.shape))
+    assert codec.decode(records[:0]).shape == (0, 24, 24)
+    packed = np.frombuffer(b"x" + records.tobytes(), np.uint8)[1:].reshape(records.shape)
+    np.testing.assert_array_equal(codec.decode(packed), expected)
+
+
+@pytest.mark.parametrize("kind", ["scene", "frames"])
+def test_decode_refuses_what_does_not_fit(kind: str) -> None:
+    codec = make_codec(ArenaConfig.model_validate({"codec": kind}))
+    records = np.zeros((2, codec.record_bytes), np.uint8)
+    frozen = np.zeros((2, 60, 60), np.uint8)
+    frozen.flags.writeable = False
+    for bad in (records[:, 1:], records.astype(np.float32)):
+        with pytest.raises(ValueError, match="records are"):
+            codec.decode(bad)
+    for out in (
+        np.zeros((1, 60, 60), np.uint8),
+        np.zeros((2, 60, 60), np.float32),
+        np.zeros((2, 60, 120), np.uint8)[..., ::2],
+        frozen,
+    ):
+        with pytest.raises(ValueError, match="out is"):
+            codec.decode(records, out)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    numbers=st.lists(st.floats(width=32), min_size=10, max_size=10),
+    orientation=st.sampled_from(["unrotated", "heading_up"]),
+)
+def test_any_record_gives_some_picture(numbers: list[float], orientation: str) -> None:
+    codec = make_codec(ArenaConfig.model_validate({"orientation": orientation}))
+    records = np.array(numbers, "<f4").view(np.uint8)
+    assert codec.decode(records).shape == (60, 60)
+
+
+@pytest.mark.parametrize("view_px", [12, 60, 255])
+@pytest.mark.parametrize("crop_px", [50.0, 333.3, 5000.0])
+def test_any_size_of_picture(view_px: int, crop_px: float) -> None:
+    for orientation in ("unrotated", "heading_up"):
+        config = ArenaConfig.model_validate(
+            {"view_px": view_px, "crop_px": crop_px, "orientation": orientation}
+        )
+        for scene in scenes(config, 3):
+            assert views(config, scene).shape == (2, view_px, view_px)
+
+
+def test_draw_arena_paints_the_paper_colours() -> None:
+    scene = Scene(np.array([[300.0, 300.0, 0.0]]), np.array([[100.0, 200.0]]))
+    picture = draw_arena(scene, ArenaConfig(num_robots=1))
+    assert picture.shape == (600, 600, 3)
+    assert picture[11, 300].tolist() == [0, 0, 255]
+    assert picture[9, 300].tolist() == picture[12, 300].tolist() == [0, 0, 0]
+    assert picture[200, 100].tolist() == [255, 0, 0]
+    assert (picture == (255, 0, 0)).all(axis=2).sum() == 900
+    assert picture[310, 300].tolist() == [255, 255, 255]
+    assert picture[300, 320].tolist() == [0, 0, 0]
+    small = draw_arena(scene, ArenaConfig(num_robots=1), 150, smooth=True)
+    assert small.shape == (150, 150, 3)
+    assert small[50, 25].tolist() == [255, 0, 0]
