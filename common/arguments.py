@@ -51,8 +51,11 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
         for name, info in model.model_fields.items():
             text = re.sub(r"\s+", " ", info.description or "").replace("%", "%%")
             default = re.sub(r"\s+", "", str(info.default)).replace("%", "%%")
+            spellings = dict.fromkeys(
+                (f"--{section}.{name}", f"--{section}.{name}".replace("_", "-"))
+            )
             group.add_argument(
-                f"--{section}.{name}",
+                *spellings,
                 dest=f"{_DEST}{section}.{name}",
                 metavar="X",
                 help=f"{text} Default: {default}",

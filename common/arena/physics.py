@@ -58,7 +58,7 @@ class World:
         low, high = reachable_px(self._config)
         self._poses: list[Pose] = [(x, y, heading) for x, y, heading in robots.tolist()]
         for i, pose in enumerate(self._poses):
-            if not (low <= min(pose[:2]) and max(pose[:2]) <= high and math.isfinite(pose[2])):
+            if not (all(low <= place <= high for place in pose[:2]) and math.isfinite(pose[2])):
                 raise ValueError(f"robot {i} at {pose} is not between the walls")
             self._put(i, pose)
         for i, shape in enumerate(self._shapes):

@@ -20,8 +20,9 @@ TARGET_GREY = 29
 ROBOT_GREY = 255
 HEADING_GREY = 0
 HEADING_WIDTH_PX = 2.0
-_LINES_A_RADIUS = 10.0  # scan lines that sample a robot's radius
-_BAR_LINES = 4  # scan lines a pixel that sample a slanted rectangle
+_NUM_LINES = 4  # scan lines a row of pixels, at Gauss-Legendre nodes: error below 5 grey levels
+_LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(_NUM_LINES)
+_NODES, _WEIGHTS = (_LEGENDRE_NODES + 1) / 2, _LEGENDRE_WEIGHTS / 2  # on [0, 1]
 
 
 class AnalyticViews:
@@ -36,7 +37,6 @@ class AnalyticViews:
         self._wall = (outer, outer + config.wall_thickness_px, float(config.size_px))
         self._target_half = config.target_size_px / 2 * scale
         self._radius = config.robot_radius_px * scale
-        self._lines = max(4, math.ceil(_LINES_A_RADIUS / self._radius))
 
     def draw(self, scenes: Float32Array, out: UInt8Array) -> None:
         """Fills out [N, V, V] from scenes [N, 3 K + 2 M]: own pose, other robots', targets."""
@@ -49,13 +49,12 @@ class AnalyticViews:
             self._wall,
             self._target_half,
             self._radius,
-            self._lines,
         )
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _draw_views(  # type: ignore[no-untyped-def]
-    scenes, out, num_robots, heading_up, scale, wall, target_half, radius, lines
+    scenes, out, num_robots, heading_up, scale, wall, target_half, radius
 ):
     size = out.shape[1]
     cover = np.zeros(size + 1, np.float64)
@@ -89,7 +88,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
                 )
         for j in range(0, 3 * num_robots, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
-            _disc(view, cover, x, y, radius, lines)
+            _disc(view, cover, x, y, radius)
         for j in range(0, 3 * num_robots, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
             if -radius < x < size + radius and -radius < y < size + radius:
@@ -171,23 +170,23 @@ def _add_span(cover, low, high, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _disc(view, cover, x, y, radius, lines):  # type: ignore[no-untyped-def]
-    """Paints a robot's disc: exact along x, `lines` scan lines a pixel along y."""
+def _disc(view, cover, x, y, radius):  # type: ignore[no-untyped-def]
+    """Paints a robot's disc: exact along x, sampled by scan lines along y."""
     size = view.shape[0]
     if not (x + radius > 0 and x - radius < size and y + radius > 0 and y - radius < size):
         return
     first, last = int(max(x - radius, 0.0)), math.ceil(min(x + radius, np.float64(size)))
     for i in range(int(max(y - radius, 0.0)), math.ceil(min(y + radius, np.float64(size)))):
         top = max(np.float64(i), y - radius) - y
-        weight = (min(i + 1.0, y + radius) - y - top) / lines
-        for k in range(lines):
-            dy = top + (k + 0.5) * weight
+        tall = min(i + 1.0, y + radius) - y - top
+        for k in range(_NUM_LINES):
+            dy = top + _NODES[k] * tall
             square = radius * radius - dy * dy
             if square > 0:
                 chord = math.sqrt(square)
                 low, high = max(x - chord, 0.0), min(x + chord, np.float64(size))
                 if low < high:
-                    _add_span(cover, low, high, weight)
+                    _add_span(cover, low, high, _WEIGHTS[k] * tall)
         for j in range(first, last):
             view[i, j] = _blend(view[i, j], ROBOT_GREY, min(cover[j], 1.0))
             cover[j] = 0.0
@@ -220,9 +219,9 @@ def _bar_across(view, cover, x, y, dx, dy, start, end, half, grey):  # type: ign
     for i in range(int(max(low_y, 0.0)), math.ceil(min(high_y, np.float64(size)))):
         first, last = size, 0
         top = max(np.float64(i), low_y) - y
-        weight = (min(i + 1.0, high_y) - y - top) / _BAR_LINES
-        for k in range(_BAR_LINES):
-            t = top + (k + 0.5) * weight
+        tall = min(i + 1.0, high_y) - y - top
+        for k in range(_NUM_LINES):
+            t = top + _NODES[k] * tall
             middle = x + t * dx / dy
             low, high = max(middle - width, 0.0), min(middle + width, np.float64(size))
             if abs(dx) > 1e-9:
@@ -231,7 +230,7 @@ def _bar_across(view, cover, x, y, dx, dy, start, end, half, grey):  # type: ign
             elif not start <= t * dy <= end:
                 continue
             if low < high:
-                _add_span(cover, low, high, weight)
+                _add_span(cover, low, high, _WEIGHTS[k] * tall)
                 first, last = min(first, int(low)), max(last, math.ceil(high))
         for j in range(first, last):
             view[i, j] = _blend(view[i, j], grey, min(cover[j], 1.0))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +32,7 @@ from services.evaluator.trial import PolicyPlayer, play
 
 _LOG = logging.getLogger("evaluator")
 _POLL_S = 0.2
+_NICE = 10  # judging gives way to learning where they share cores
 BEST = Path("checkpoints") / "best.safetensors"
 
 
@@ -39,6 +41,7 @@ def main(argv: Sequence[str]) -> int:
     joining = joining_arguments("evaluator", argv)
     keys, worker = joining.keys, joining.worker
     stop = StopSignal().listen()
+    os.nice(_NICE)
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)
         torch.set_num_threads(config.evaluator.threads)
@@ -71,7 +74,8 @@ def main(argv: Sequence[str]) -> int:
             publisher.put(encode(result))
             best.offer(weights, result)
             newer = None
-            rest_until_s = began_s + config.evaluator.period_s
+            share = config.evaluator.max_share
+            rest_until_s = began_s + max(config.evaluator.period_s, result.wall_s / share)
             while go_on() and (newer is None or time.monotonic() < rest_until_s):
                 newer = reader.latest(_POLL_S) or newer
             weights = newer

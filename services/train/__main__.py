@@ -27,12 +27,14 @@ _LOG = logging.getLogger("train")
 _TICK_S = 0.25
 _PLAIN_PERIOD_S = 10.0
 _PICTURES_S = 300.0
+_ENOUGH_CORES = 4
 
 
 def main(argv: Sequence[str]) -> int:
     """Train; the exit code."""
     with open_run(argv) as run:
         stop = StopSignal().listen()
+        _LOG.info("run %s: %s", run.path, expectation(run.config))
         endpoint = (run.config.transport.listen or (free_endpoint(),))[0]
         fleet = Fleet(run.logs)
         try:
@@ -120,6 +122,13 @@ def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
     run_dir = str(run.path.parent)
     name = run.path.name
     return ["--run", name, "--connect", endpoint, "--run-dir", run_dir, "--id", worker]
+
+
+def expectation(config: Config) -> str:
+    """What this machine means for the run, in words."""
+    cores, actors = available_cores(), config.run.actors or default_actors()
+    pace = "" if cores >= _ENOUGH_CORES else ", slower than on the 4 that the docs speak of"
+    return f"{cores} cores, {actors} actor{'s' if actors > 1 else ''}{pace}"
 
 
 def default_actors() -> int:

@@ -1,6 +1,7 @@
 """Pictures: the analytic renderer against OpenCV, symmetries, and what any bytes give."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,13 +48,13 @@ def test_a_picture_by_hand() -> None:
     config = ArenaConfig(num_robots=1, targets_px=((455, 305),), robot_radius_px=30)
     view = views(config, Scene(np.array([[300.0, 300.0, 0.0]]), np.array([[455.0, 305.0]])))[0]
     assert view[0].max() == 0
-    np.testing.assert_array_equal(view[1, 1:59], [15] * 58)  # 2 of 10 px of grey 76
-    np.testing.assert_array_equal(view[1:59, 58], [15] * 58)
+    np.testing.assert_array_equal(view[1, 2:58], [15] * 56)  # 2 of 10 px of grey 76
+    np.testing.assert_array_equal(view[2:58, 58], [15] * 56)
     np.testing.assert_array_equal(view[29:32, 44:47], np.full((3, 3), 29))
     assert view[28:33, 43:48].sum() == 9 * 29
     np.testing.assert_array_equal(view[28, 28:32], [255] * 4)
     # the heading's upper half: 1 of 10 px
-    np.testing.assert_array_equal(view[29, 28:33], [255, 255, 230, 230, 230])
+    np.testing.assert_allclose(view[29, 28:32], [255, 255, 229.5, 229.5], atol=0.5)
     assert view[27:33, 27:33].sum() == pytest.approx(255 * (np.pi * 9 - 3 * 0.2), rel=2e-3)
 
 
@@ -77,7 +78,7 @@ def test_the_mapped_scene_gives_the_mapped_picture(symmetry: Symmetry) -> None:
             assert gaps.max() <= 1
         else:  # discs are exact along x and sampled along y
             assert np.quantile(gaps, 0.999) <= 3
-            assert gaps.max() <= 12
+            assert gaps.max() <= 7
 
 
 @pytest.mark.parametrize("symmetry", EVERY)
@@ -87,7 +88,7 @@ def test_heading_up_knows_mirrors_only(symmetry: Symmetry) -> None:
     for scene in scenes(config, 20):
         mapped = views(config, symmetry.apply_to_scene(scene, config.size_px)).astype(int)
         gaps = np.abs(mapped - mirror.apply_to_pictures(views(config, scene)))
-        assert gaps.max() <= 2
+        assert gaps.max() <= 3
 
 
 def test_actions_are_swapped_by_mirrors_only() -> None:
@@ -150,17 +151,18 @@ def test_decode_refuses_what_does_not_fit(kind: str) -> None:
     records = np.zeros((2, codec.record_bytes), np.uint8)
     frozen = np.zeros((2, 60, 60), np.uint8)
     frozen.flags.writeable = False
+    bad: Any
     for bad in (records[:, 1:], records.astype(np.float32)):
         with pytest.raises(ValueError, match="records are"):
             codec.decode(bad)
-    for out in (
+    for bad in (
         np.zeros((1, 60, 60), np.uint8),
         np.zeros((2, 60, 60), np.float32),
         np.zeros((2, 60, 120), np.uint8)[..., ::2],
         frozen,
     ):
         with pytest.raises(ValueError, match="out is"):
-            codec.decode(records, out)
+            codec.decode(records, bad)
 
 
 @settings(max_examples=200, deadline=None)
