@@ -7,6 +7,7 @@ right one.
 """
 
 import difflib
+import json
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -215,7 +216,8 @@ class LearnerConfig(Section):
     device: str = "auto"
     """`auto`: cuda if there is one, else cpu. (ours)"""
     threads: Annotated[int, Field(ge=0)] = 0
-    """Torch threads; 0: the cores less one, at least 1. (ours)"""
+    """Torch threads; 0: half the cores, at least 1. More than are really free make a step far
+    slower, because threads wait for one another. (ours)"""
     prefetch_batches: Count = 8
     """Batches decoded ahead of the step. (ours)"""
     requests_in_flight: Count = 4
@@ -333,17 +335,20 @@ def _unknown(name: str, known: Sequence[str], what: str, where: str) -> ConfigEr
     return ConfigError(f"{where}: unknown {what} {name!r}{hint}")
 
 
-def _read_toml(source: str) -> tuple[dict[str, Any], str]:
-    """The table of a preset or file, with what it extends merged below it; and its name."""
+def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The table of a preset or file, with what it extends merged below it.
+
+    above: the files that extend this one.
+    """
     path = Path(source)
     if source in preset_names():
         text = (resources.files("configs") / f"{source}.toml").read_text("utf-8")
     else:
         try:
             text = path.read_text("utf-8")
-        except OSError as error:
+        except (OSError, UnicodeDecodeError) as error:
             presets = ", ".join(preset_names())
-            reason = error.strerror or str(error)
+            reason = getattr(error, "strerror", None) or str(error)
             raise ConfigError(
                 f"config {source!r}: {reason}; give a file or a preset: {presets}"
             ) from error
@@ -352,16 +357,13 @@ def _read_toml(source: str) -> tuple[dict[str, Any], str]:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"config {source!r} is not TOML: {error}") from error
     base = table.pop(EXTENDS, None)
+    _check_names(table, f"config {source!r}")
     if base is None:
-        return table, source
-    if base == source:
-        raise ConfigError(f"config {source!r} extends itself")
-    below, _ = _read_toml(str(base))
-    for section, values in table.items():
-        below[section] = (
-            {**below.get(section, {}), **values} if isinstance(values, dict) else values
-        )
-    return below, source
+        return table
+    if base in (*above, source):
+        raise ConfigError(f"config {source!r} extends itself, by {', '.join((*above, source))}")
+    below = _read_toml(str(base), (*above, source))
+    return below | {name: {**below.get(name, {}), **values} for name, values in table.items()}
 
 
 def _check_names(table: Mapping[str, Any], where: str) -> None:
@@ -419,8 +421,7 @@ def load_config(
     """
     table: dict[str, Any] = {}
     if source is not None:
-        table, name = _read_toml(source)
-        _check_names(table, f"config {name!r}")
+        table = _read_toml(source)
     env = environment_overrides(os.environ if environ is None else environ)
     for dotted, text in env.items():
         _merge_text(table, dotted, text, "environment")
@@ -464,8 +465,7 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     return repr(value)

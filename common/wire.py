@@ -117,7 +117,8 @@ def decode(cls: type[M], data: bytes) -> M:
         raise WireError("not a map")
     schema = table.pop("schema", None)
     if schema != _SCHEMAS[cls]:
-        raise WireError(f"schema {str(schema)[:40]!r} where {_SCHEMAS[cls]!r} is due")
+        given = schema[:40] if isinstance(schema, str) else type(schema).__name__
+        raise WireError(f"schema {given!r} where {_SCHEMAS[cls]!r} is due")
     readers = _READERS[cls]
     if table.keys() != readers.keys():
         odd = sorted(map(str, table.keys() ^ readers.keys()))
@@ -153,7 +154,7 @@ def _reader(hint: Any) -> Callable[[Any], Any]:
     if origin is dict:
         return _dict_reader(_reader(args[1]))
     if isinstance(hint, type) and issubclass(hint, enum.StrEnum):
-        return hint
+        return _enum_reader(hint)
     if hint is float:
         return _read_float
     if hint is int:
@@ -192,6 +193,17 @@ def _dict_reader(reader: Callable[[Any], Any]) -> Callable[[Any], Any]:
         if not isinstance(value, dict) or any(type(k) is not str for k in value):
             raise TypeError("no map with names")
         return {k: reader(v) for k, v in value.items()}
+
+    return read
+
+
+def _enum_reader(expected: type[enum.StrEnum]) -> Callable[[Any], Any]:
+    members = {str(member): member for member in expected}
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, str) or value not in members:
+            raise TypeError(f"none of {', '.join(members)}")
+        return members[value]
 
     return read
 

@@ -20,7 +20,7 @@ TARGET_GREY = 29
 ROBOT_GREY = 255
 HEADING_GREY = 0
 HEADING_WIDTH_PX = 2.0
-_NUM_LINES = 4  # scan lines a row of pixels, at Gauss-Legendre nodes: error below 5 grey levels
+_NUM_LINES = 4  # scan lines a row of pixels, at Gauss-Legendre nodes: 5 grey levels off at most
 _LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(_NUM_LINES)
 _NODES, _WEIGHTS = (_LEGENDRE_NODES + 1) / 2, _LEGENDRE_WEIGHTS / 2  # on [0, 1]
 
@@ -97,7 +97,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
                 _bar(view, cover, x, y, across, along, 0.0, radius, hand_width, HEADING_GREY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _map(x, y, c, s, scale, size):  # type: ignore[no-untyped-def]
     """Picture coordinates of a place relative to the robot."""
     return (c * x - s * y) * scale + 0.5 * size, (s * x + c * y) * scale + 0.5 * size
@@ -135,7 +135,7 @@ def _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall):  # type: ignor
         _bar(view, cover, x, y, -s, c, 0.0, short, width, WALL_GREY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _blend(value, grey, share):  # type: ignore[no-untyped-def]
     """A pixel after a shape covered a share of it."""
     return np.uint8(value + (grey - np.float64(value)) * share + 0.5)
@@ -156,7 +156,7 @@ def _box(view, x0, x1, y0, y1, grey):  # type: ignore[no-untyped-def]
             view[i, j] = _blend(view[i, j], grey, tall * wide)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _add_span(cover, low, high, weight):  # type: ignore[no-untyped-def]
     """Adds to each pixel of a line weight x its part of [low, high], within [0, V]."""
     first, last = int(low), int(high)

@@ -126,7 +126,8 @@ class Best:
             _, manifest = read_weights(path)
         except CheckpointError:
             manifest = {}
-        self._rank = (float(manifest.get("success_rate", -1)), -np.inf)
+        rate, frames = manifest.get("success_rate", -1), manifest.get("mean_frames", np.inf)
+        self._rank = (float(rate), -float(frames))
 
     def offer(self, weights: Weights, result: Evaluation) -> None:
         """Keep the weights if they did better: more successes, or as many in less time."""

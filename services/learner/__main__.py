@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> int:
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
         config = fetch_config(session, joining, stop)
         settings = config.learner
-        torch.set_num_threads(settings.threads or max(1, available_cores() - 1))
+        torch.set_num_threads(settings.threads or max(1, available_cores() // 2))
         learner = Learner(
             config.agent, settings, stack=config.arena.stack, view_px=config.arena.view_px
         )

@@ -64,7 +64,8 @@ def build(config: Config) -> tuple[Table, RateLimiter]:
     """The table and limiter a configuration asks for."""
     table = Table(
         capacity=config.replay.capacity,
-        window=config.arena.stack + config.agent.n_step,
+        stack=config.arena.stack,
+        n_step=config.agent.n_step,
         record_bytes=config.arena.record_bytes,
         rng=np.random.default_rng(config.replay.seed),
     )

@@ -99,6 +99,11 @@ class ReplayService:
     def _insert(self, request: _Request) -> None:
         chunk = decode(Chunk, request.payload)
         self._table.check(chunk)
+        if len(chunk) > self._limiter.largest_insert:
+            raise WireError(
+                f"{len(chunk)} transitions where the run's actor.chunk_length is "
+                f"{self._limiter.largest_insert}: the rate limiter might never let them in"
+            )
         with self._changed:
             arrival = self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
             if arrival is Arrival.REPEATED:
@@ -132,6 +137,7 @@ class ReplayService:
     def _wait(self, flag: str, request: _Request, ready: "_Ready") -> bool:
         """Wait, the lock given up meanwhile, until ready; False where that took too long."""
         if ready():
+            self._held[flag] = False
             return True
         self._held[flag] = True
         left = request.arrived_s + self._config.replay.hold_s - time.monotonic()

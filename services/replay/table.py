@@ -30,13 +30,15 @@ class _Extent:
 class Table:
     """First in, first out, sampled uniformly with replacement.
 
-    capacity: transitions. window: records one transition touches (stack + n). record_bytes:
-    length of one record. rng: draws the samples.
+    capacity: transitions. stack: records of a state. n_step: longest return; a transition
+    touches a window of stack + n_step records. record_bytes: length of one record. rng: draws
+    the samples.
     """
 
     def __init__(
-        self, capacity: int, window: int, record_bytes: int, rng: np.random.Generator
+        self, capacity: int, stack: int, n_step: int, record_bytes: int, rng: np.random.Generator
     ) -> None:
+        window = stack + n_step
         num_rows = int(capacity * _ROW_SLACK) + 2 * window
         try:
             self._rows: UInt8Array = np.zeros((num_rows, record_bytes), np.uint8)
@@ -47,6 +49,7 @@ class Table:
             ) from error
         self._capacity = capacity
         self._window = window
+        self._n_step = n_step
         # [num_rows - window + 1, window, R], a view: sampling is one gather of contiguous spans.
         self._windows = sliding_window_view(self._rows, window, axis=0).transpose(0, 2, 1)
         self._start_rows = np.zeros(capacity, np.int64)
@@ -94,8 +97,8 @@ class Table:
                 f"records of {record_bytes} bytes, {tail} more than transitions, where "
                 f"{self._rows.shape[1]} and {self._window - 1} are due: another arena or agent?"
             )
-        if int(chunk.bootstrap_offsets.max()) > tail:
-            raise WireError("a bootstrap offset points behind the chunk's records")
+        if int(chunk.bootstrap_offsets.max()) > self._n_step:
+            raise WireError(f"a bootstrap offset exceeds agent.n_step, {self._n_step}")
         if len(chunk) > self._capacity:
             raise WireError(f"{len(chunk)} transitions exceed the capacity {self._capacity}")
 

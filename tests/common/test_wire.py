@@ -1,0 +1,315 @@
+"""What is encoded is decoded to the same, and whatever else arrives is refused as WireError."""
+
+import dataclasses
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from common.errors import WireError
+from common.trajectory import (
+    Chunk,
+    EpisodeSummary,
+    Evaluation,
+    InsertReply,
+    Outcome,
+    Samples,
+    Stats,
+    Weights,
+)
+from common.wire import SampleRequest, decode, encode
+
+INTS = st.integers(-(2**63), 2**63 - 1)
+COUNTS = st.integers(0, 2**63 - 1)
+FLOATS = st.floats(allow_nan=False)
+SHARES = st.floats(0, 1)
+NAMES = st.text(max_size=20)
+
+
+def arrays(dtype: str, *shape: int, **numbers: Any) -> st.SearchStrategy[Any]:
+    kind = np.dtype(dtype).kind
+    elements = npst.from_dtype(np.dtype(dtype), **numbers) if kind == "f" else None
+    return npst.arrays(dtype, shape, elements=elements)
+
+
+FINITE = {"allow_nan": False, "allow_infinity": False}
+
+
+@st.composite
+def chunks(draw: st.DrawFn) -> Chunk:
+    length, tail, record_bytes = draw(st.tuples(*[st.integers(1, 6)] * 3))
+    prioritized = draw(st.booleans())
+    return Chunk(
+        actor=draw(NAMES),
+        incarnation=draw(INTS),
+        sequence=draw(COUNTS),
+        weights_version=draw(COUNTS),
+        records=draw(arrays("u1", length + tail, record_bytes)),
+        actions=draw(arrays("u1", length)),
+        rewards=draw(arrays("f4", length, **FINITE)),
+        discounts=draw(arrays("f4", length, **FINITE)),
+        bootstrap_offsets=draw(npst.arrays("u1", (length,), elements=st.integers(1, 255))),
+        priorities=draw(arrays("f4", length if prioritized else 0, min_value=0, **FINITE)),
+    )
+
+
+@st.composite
+def samples(draw: st.DrawFn) -> Samples:
+    size, window, record_bytes = draw(st.tuples(*[st.integers(0, 5)] * 3))
+    return Samples(
+        keys=draw(arrays("i8", size)),
+        probabilities=draw(arrays("f8", size, **FINITE)),
+        table_size=draw(COUNTS),
+        records=draw(arrays("u1", size, window, record_bytes)),
+        actions=draw(arrays("u1", size)),
+        rewards=draw(arrays("f4", size, **FINITE)),
+        discounts=draw(arrays("f4", size, **FINITE)),
+        bootstrap_offsets=draw(arrays("u1", size)),
+        weights_versions=draw(arrays("i8", size)),
+    )
+
+
+EPISODES = st.builds(
+    EpisodeSummary,
+    actor=NAMES,
+    arena=INTS,
+    episode=INTS,
+    outcome=st.sampled_from(Outcome),
+    frames=INTS,
+    score=FLOATS,
+    collisions=INTS,
+    epsilon=FLOATS,
+    weights_version=INTS,
+    mean_q=FLOATS,
+)
+EVALUATIONS = st.builds(
+    Evaluation,
+    worker=NAMES,
+    weights_epoch=INTS,
+    weights_version=INTS,
+    learner_step=INTS,
+    num_robots=INTS,
+    episodes=INTS,
+    success_rate=SHARES,
+    collision_rate=SHARES,
+    timeout_rate=SHARES,
+    success_interval=st.tuples(SHARES, SHARES),
+    max_per_100=FLOATS,
+    mean_per_100=FLOATS,
+    variance_per_100=FLOATS,
+    mean_frames=FLOATS,
+    mean_score=FLOATS,
+    seed=INTS,
+    wall_s=FLOATS,
+)
+MESSAGES = st.one_of(
+    chunks(),
+    samples(),
+    EPISODES,
+    EVALUATIONS,
+    st.builds(InsertReply, sequence=INTS, duplicate=st.booleans(), inserts=INTS),
+    st.builds(SampleRequest, batch_size=INTS),
+    st.builds(Weights, epoch=INTS, version=INTS, learner_step=INTS, payload=st.binary()),
+    st.builds(
+        Stats,
+        role=NAMES,
+        id=NAMES,
+        metrics=st.dictionaries(NAMES, FLOATS, max_size=5),
+        text=st.dictionaries(NAMES, NAMES, max_size=5),
+    ),
+)
+CLASSES = (
+    Chunk,
+    Samples,
+    EpisodeSummary,
+    Evaluation,
+    InsertReply,
+    SampleRequest,
+    Weights,
+    Stats,
+)
+
+
+def assert_same(found: Any, expected: Any) -> None:
+    assert type(found) is type(expected)
+    for field in dataclasses.fields(expected):
+        ours, theirs = getattr(found, field.name), getattr(expected, field.name)
+        assert type(ours) is type(theirs), field.name
+        if isinstance(theirs, np.ndarray):
+            assert ours.dtype == theirs.dtype
+            np.testing.assert_array_equal(ours, theirs, strict=True)
+        else:
+            assert ours == theirs, field.name
+
+
+@given(MESSAGES)
+def test_every_message_comes_back_as_it_was(message: Any) -> None:
+    assert_same(decode(type(message), encode(message)), message)
+
+
+def test_an_array_that_is_not_contiguous_comes_back_as_it_was() -> None:
+    rows = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    message = dataclasses.replace(CHUNK, records=rows.T[::2])
+    np.testing.assert_array_equal(decode(Chunk, encode(message)).records, rows.T[::2])
+
+
+def test_arrays_are_little_endian_and_read_only_views() -> None:
+    message = dataclasses.replace(CHUNK, rewards=np.array([1.0, 2.0], ">f4"))
+    found = decode(Chunk, encode(message)).rewards
+    assert found.tolist() == [1.0, 2.0]
+    assert not found.flags.writeable
+    assert b"\x00\x00\x80\x3f\x00\x00\x00\x40" in encode(message)
+
+
+CHUNK = Chunk(
+    actor="actor-0",
+    incarnation=1,
+    sequence=0,
+    weights_version=3,
+    records=np.arange(5 * 4, dtype=np.uint8).reshape(5, 4),
+    actions=np.array([0, 2], np.uint8),
+    rewards=np.array([1.0, -5.0], np.float32),
+    discounts=np.array([0.9, 0.0], np.float32),
+    bootstrap_offsets=np.array([1, 1], np.uint8),
+    priorities=np.empty(0, np.float32),
+)
+STATS = Stats("actor", "actor-0", {"env_steps": 3.0})
+EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
+_DEEP = b"\x91" * 1000 + b"\x90"  # a list in a list in a list …, as deep as msgpack unpacks
+
+
+def table_of(message: Any) -> dict[str, Any]:
+    table: dict[str, Any] = msgpack.unpackb(encode(message))
+    return table
+
+
+def changed(message: Any, **fields: Any) -> bytes:
+    """The message's bytes with these fields otherwise; ... leaves one out."""
+    table = {**table_of(message), **fields}
+    packed: bytes = msgpack.packb({k: v for k, v in table.items() if v is not ...})
+    return packed
+
+
+def floats(*values: float) -> list[Any]:
+    return [[len(values)], np.array(values, "<f4").tobytes()]
+
+
+def octets(*values: int) -> list[Any]:
+    return [[len(values)], bytes(values)]
+
+
+MALFORMED = {
+    "empty": (Chunk, b"", "no msgpack"),
+    "truncated": (Chunk, encode(CHUNK)[:-1], "no msgpack"),
+    "trailing bytes": (Chunk, encode(CHUNK) + b"\x00", "no msgpack"),
+    "never used byte": (Chunk, b"\xc1", "no msgpack"),
+    "not a map": (Chunk, msgpack.packb([1, 2]), "not a map"),
+    "number as key": (Chunk, msgpack.packb({1: 2}), "no msgpack"),
+    "no schema": (Chunk, changed(CHUNK, schema=...), "NoneType.*'chunk/1' is due"),
+    "another schema": (Chunk, encode(STATS), "'stats/1' where 'chunk/1' is due"),
+    "newer schema": (Chunk, changed(CHUNK, schema="chunk/2"), "'chunk/2' where"),
+    "long schema": (Chunk, changed(CHUNK, schema="x" * 10_000), f"'{'x' * 40}' where"),
+    "nested schema": (Chunk, b"\x81\xa6schema" + _DEEP, "'list' where"),
+    "missing field": (Chunk, changed(CHUNK, actor=...), "unknown fields: actor"),
+    "unknown field": (Chunk, changed(CHUNK, done=1), "unknown fields: done"),
+    "name as bytes": (Chunk, changed(CHUNK, actor=b"a"), "actor: no str"),
+    "name not UTF-8": (Chunk, encode(CHUNK).replace(b"actor-0", b"actor-\xff"), "no msgpack"),
+    "float for an integer": (Chunk, changed(CHUNK, incarnation=1.0), "incarnation: no integer"),
+    "bool for an integer": (Chunk, changed(CHUNK, sequence=True), "sequence: no integer"),
+    "integer of 65 bits": (Chunk, changed(CHUNK, sequence=2**63), "outside 64 bits"),
+    "text for a number": (EpisodeSummary, changed(EPISODE, score="1"), "score: no number"),
+    "unknown outcome": (EpisodeSummary, changed(EPISODE, outcome="draw"), "outcome: none of"),
+    "outcome no name": (EpisodeSummary, changed(EPISODE, outcome=[1]), "outcome: none of"),
+    "integer for a bool": (
+        InsertReply,
+        changed(InsertReply(1, False, 2), duplicate=0),
+        "duplicate: no bool",
+    ),
+    "metrics no map": (Stats, changed(STATS, metrics=[]), "metrics: no map"),
+    "metric no number": (Stats, changed(STATS, metrics={"a": "b"}), "metrics: no number"),
+    "metric named by bytes": (Stats, changed(STATS, metrics={b"a": 1.0}), "metrics: no map"),
+    "array no pair": (Chunk, changed(CHUNK, actions=[1, 2, 3]), "actions: no pair"),
+    "shape no list": (Chunk, changed(CHUNK, actions=[2, b"ab"]), "actions: no pair"),
+    "array as text": (Chunk, changed(CHUNK, actions=[[2], "ab"]), "actions: no pair"),
+    "9 dimensions": (Chunk, changed(CHUNK, actions=[[1] * 9, b"a"]), "actions: no pair"),
+    "wrong dtype": (Chunk, changed(CHUNK, rewards=octets(1, 2)), "does not fit 2 bytes"),
+    "negative shape": (Chunk, changed(CHUNK, records=[[-5, -4], b"a" * 20]), "natural number"),
+    "fractional shape": (Chunk, changed(CHUNK, records=[[5.0, 4.0], b"a" * 20]), "natural number"),
+    "huge shape": (Chunk, changed(CHUNK, records=[[2**40, 2**40], b""]), "does not fit 0 bytes"),
+    "huge empty shape": (Chunk, changed(CHUNK, records=[[0, 2**64 - 1], b""]), "records: "),
+    "too many for an array": (Chunk, changed(CHUNK, records=[[0, *[2**62] * 7], b""]), "records: "),
+    "records a vector": (Chunk, changed(CHUNK, records=octets(*range(20))), "no matrix"),
+    "too few records": (Chunk, changed(CHUNK, records=[[2, 4], b"a" * 8]), "no matrix"),
+    "actions a matrix": (Chunk, changed(CHUNK, actions=[[2, 1], b"ab"]), "are vectors"),
+    "lengths differ": (Chunk, changed(CHUNK, actions=octets(1)), "differ in length"),
+    "no transition": (
+        Chunk,
+        changed(
+            CHUNK,
+            actions=octets(),
+            rewards=floats(),
+            discounts=floats(),
+            bootstrap_offsets=octets(),
+        ),
+        "or are empty",
+    ),
+    "NaN reward": (Chunk, changed(CHUNK, rewards=floats(1, np.nan)), "not finite"),
+    "infinite discount": (Chunk, changed(CHUNK, discounts=floats(1, np.inf)), "not finite"),
+    "negative priority": (Chunk, changed(CHUNK, priorities=floats(1, -1)), "priority is negative"),
+    "one priority of two": (Chunk, changed(CHUNK, priorities=floats(1)), "priorities has neither"),
+    "offset 0": (Chunk, changed(CHUNK, bootstrap_offsets=octets(1, 0)), "offset is 0"),
+    "negative sequence": (Chunk, changed(CHUNK, sequence=-1), "is negative"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_the_malformed_is_refused_with_its_reason(name: str) -> None:
+    cls, data, reason = MALFORMED[name]
+    with pytest.raises(WireError, match=reason) as refused:
+        decode(cls, data)
+    assert len(str(refused.value)) < 250
+    assert "\n" not in str(refused.value)
+
+
+def test_the_unchanged_message_is_taken() -> None:
+    assert_same(decode(Chunk, changed(CHUNK)), CHUNK)
+
+
+@given(st.sampled_from(CLASSES), st.binary(max_size=200))
+def test_random_bytes_raise_nothing_else(cls: type, data: bytes) -> None:
+    with pytest.raises(WireError):
+        decode(cls, data)
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | NAMES | st.binary(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(NAMES, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(message=MESSAGES, data=st.data())
+def test_a_field_of_any_other_kind_is_taken_wholly_or_refused(message: Any, data: Any) -> None:
+    names = [field.name for field in dataclasses.fields(message)]
+    name = data.draw(st.sampled_from(names))
+    packed = changed(message, **{name: data.draw(ANYTHING)})
+    try:
+        found = decode(type(message), packed)
+    except WireError:
+        return
+    assert type(getattr(found, name)) is type(getattr(message, name))
+
+
+@given(message=MESSAGES, data=st.data())
+def test_a_damaged_byte_raises_nothing_else(message: Any, data: Any) -> None:
+    damaged = bytearray(encode(message))
+    place = data.draw(st.integers(0, len(damaged) - 1))
+    damaged[place] ^= data.draw(st.integers(1, 255))
+    try:
+        assert type(decode(type(message), bytes(damaged))) is type(message)
+    except WireError:
+        pass
