@@ -177,6 +177,11 @@ class ReplayConfig(Section):
     """Share of min_size x samples_per_insert by which either side may run ahead. (ours)"""
     hold_s: Positive = 5.0
     """A request the limiter holds is answered "held" after this; the client asks again. (ours)"""
+    fsync: Literal["never", "always", "off"] = "never"
+    """Of the log of accepted chunks: `never` outlives kill -9, `always` a power cut as well, at
+    the disk's pace; `off` keeps no log. (ours)"""
+    segment_bytes: Count = 64 << 20
+    """Size at which the log starts a new file; whole files go as the table evicts. (ours)"""
     seed: int = 0
     """Of the sampler. (ours)"""
 

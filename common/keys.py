@@ -2,6 +2,7 @@
 
 mrcdrl/<run>/replay/<shard>/insert     query: Chunk -> InsertReply
 mrcdrl/<run>/replay/<shard>/sample     query: SampleRequest -> Samples
+mrcdrl/<run>/config                    query: nothing -> the configuration as TOML
 mrcdrl/<run>/weights                   publication and query: Weights
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary

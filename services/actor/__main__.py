@@ -3,6 +3,7 @@
 import logging
 import sys
 import time
+import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -137,7 +138,9 @@ def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
     seeds = np.random.SeedSequence([config.run.seed, name_entropy])
     *arena_seeds, policy_seed = seeds.spawn(config.actor.num_arenas + 1)
     arenas = [
-        make_arena(config.arena, np.random.default_rng(seed), identity=index)
+        make_arena(
+            config.arena, np.random.default_rng(seed), identity=arena_identity(worker, index)
+        )
         for index, seed in enumerate(arena_seeds)
     ]
     origin = Origin(
@@ -150,6 +153,11 @@ def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
     )
     codec = make_codec(config.arena)
     return Collector(config, origin, arenas, codec, policy, np.random.default_rng(policy_seed))
+
+
+def arena_identity(worker: str, arena: int) -> int:
+    """What the pictures of a counting arena carry, in 16 bits: which of whose arenas it is."""
+    return (zlib.crc32(worker.encode()) + arena) % 2**16
 
 
 if __name__ == "__main__":

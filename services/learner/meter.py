@@ -37,6 +37,7 @@ class Meter:
             "weights_version": self._keeper.version,
             "weights_epoch": self._keeper.epoch,
             "batches_ready": self._prefetcher.ready,
+            "batches_refused": self._prefetcher.refused,
             "decode_share": self._prefetcher.decode_s / lived_s,
         }
         metrics |= {f"{stage}_share": s / lived_s for stage, s in self._seconds.items()}

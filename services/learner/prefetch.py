@@ -3,17 +3,19 @@
 Invariant: at most `depth` decoded batches wait; when they do, no further one is asked for.
 """
 
+import logging
 import queue
 import threading
 import time
 from collections.abc import Callable
 
-from common.errors import MrcdrlError
+from common.errors import MrcdrlError, WireError
 from common.process import StopSignal
 from common.trajectory import Samples
 from services.learner.batch import Batch
 from services.replay.client import ReplayReader
 
+_LOG = logging.getLogger("learner")
 _POLL_S = 0.2
 
 
@@ -33,6 +35,7 @@ class Prefetcher:
         self._stop = stop
         self._error: Exception | None = None
         self.decode_s = 0.0
+        self.refused = 0
         self._thread = threading.Thread(target=self._run, name="prefetch")
         self._thread.start()
 
@@ -63,14 +66,22 @@ class Prefetcher:
         self._thread.join()
 
     def _run(self) -> None:
-        try:
-            while (samples := self._reader.sample()) is not None:
+        while not self._stop.is_set():
+            try:
+                samples = self._reader.sample()
+                if samples is None:
+                    return
                 started = time.perf_counter()
                 batch = self._collate(samples)
-                self.decode_s += time.perf_counter() - started
-                self._put(batch)
-        except MrcdrlError as error:
-            self._error = error
+            except WireError as error:
+                self.refused += 1
+                _LOG.warning("a mini-batch refused: %s", error)
+                continue
+            except MrcdrlError as error:
+                self._error = error
+                return
+            self.decode_s += time.perf_counter() - started
+            self._put(batch)
 
     def _put(self, batch: Batch) -> None:
         while not self._stop.is_set():

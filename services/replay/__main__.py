@@ -3,6 +3,7 @@
 import logging
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from common.keys import Keys, check_name
 from common.process import StatsReporter, StopSignal, run_main
 from common.transport import Session
 from services.replay.limiter import RateLimiter
+from services.replay.log import SegmentLog
 from services.replay.service import ReplayService
 from services.replay.table import Table
 
@@ -27,6 +29,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--listen", action="append", help="endpoint, such as tcp/127.0.0.1:7447")
     parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
     parser.add_argument("--id", default="replay-0", help="this worker's name")
+    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
     config = load_config(arguments.config, overrides(arguments))
@@ -40,14 +43,16 @@ def main(argv: Sequence[str]) -> int:
     worker = check_name(arguments.id, "--id")
     stop = StopSignal().listen()
     table, limiter = build(config)
+    log = open_log(config, arguments.run_dir / arguments.run / "replay" / "0")
     with Session(transport) as session:
         configs = session.server(keys.config)
         inserts, samples = session.server(keys.insert()), session.server(keys.sample())
         reporter = StatsReporter(session.publisher(keys.stats("replay", worker)), "replay", worker)
-        service = ReplayService(config, table, limiter, inserts, samples)
+        service = ReplayService(config, table, limiter, inserts, samples, log)
+        service.recover()
         service.start()
         session.announce(keys.live("replay", worker))
-        _LOG.info("serving %s of %d transitions", arguments.run, config.replay.capacity)
+        _LOG.info("serving %s, %d of %d transitions", arguments.run, len(table), table.capacity)
         shared = to_toml(config).encode()
         try:
             while not stop.is_set() and service.healthy:
@@ -57,7 +62,20 @@ def main(argv: Sequence[str]) -> int:
                 reporter.maybe(service.metrics)
         finally:
             service.stop()
+            if log is not None:
+                log.close()
     return 0 if stop.is_set() else 1
+
+
+def open_log(config: Config, directory: Path) -> SegmentLog | None:
+    """The log a configuration asks for."""
+    if config.replay.fsync == "off":
+        return None
+    return SegmentLog(
+        directory,
+        segment_bytes=config.replay.segment_bytes,
+        fsync=config.replay.fsync == "always",
+    )
 
 
 def build(config: Config) -> tuple[Table, RateLimiter]:

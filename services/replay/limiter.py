@@ -67,6 +67,11 @@ class RateLimiter:
             return False
         return not self.samples_per_insert or self._lead - count >= -self.error_buffer
 
+    def resume(self, inserts: int) -> None:
+        """Go on after `inserts` of earlier processes, neither side ahead."""
+        self.inserts = inserts
+        self.samples = round(max(inserts - self.min_size, 0) * self.samples_per_insert)
+
     @property
     def ratio(self) -> float:
         """Samples per insert so far, counted from the first insert that could be sampled."""

@@ -1,21 +1,26 @@
 """The shell around the table: one thread inserts, one samples, under one lock.
 
-Invariants: a chunk is acknowledged only after it is in the table; a request is answered within
-`hold_s`, by the data, a refusal with its reason, or "held", which asks the peer to try again.
+Invariants: a chunk is acknowledged only after it is in the log and the table; a request is
+answered within `hold_s`: by the data, a refusal with its reason, or "held", which asks the peer
+to try again.
 """
 
+import logging
 import threading
 import time
 from typing import Protocol
 
 from common.config import Config
 from common.errors import WireError
+from common.files import reason
 from common.trajectory import Chunk, InsertReply
 from common.wire import SampleRequest, decode, encode
 from services.replay.limiter import RateLimiter
+from services.replay.log import SegmentLog
 from services.replay.sequence import Arrival, SequenceBook
 from services.replay.table import Table
 
+_LOG = logging.getLogger("replay")
 _TAKE_S = 0.2  # how soon a thread sees that it is to stop
 
 
@@ -38,20 +43,45 @@ class ReplayService:
     """Serves inserts and samples until `stop`."""
 
     def __init__(
-        self, config: Config, table: Table, limiter: RateLimiter, inserts: _Server, samples: _Server
+        self,
+        config: Config,
+        table: Table,
+        limiter: RateLimiter,
+        inserts: _Server,
+        samples: _Server,
+        log: SegmentLog | None = None,
     ) -> None:
+        """log: what outlives the process; None: nothing does."""
         self._config = config
         self._table = table
         self._limiter = limiter
+        self._log = log
         self._book = SequenceBook()
         self._changed = threading.Condition()
         self._stopping = threading.Event()
-        self._counts = dict.fromkeys(("chunks", "duplicates", "gaps", "refused"), 0)
+        self._counts = dict.fromkeys(("chunks", "duplicates", "gaps", "refused", "log_errors"), 0)
         self._held = {"insert_held": False, "sample_held": False}
         self._threads = [
             threading.Thread(target=self._serve, args=(inserts, self._insert), name="insert"),
             threading.Thread(target=self._serve, args=(samples, self._sample), name="sample"),
         ]
+
+    def recover(self) -> None:
+        """Take in what the log kept of earlier processes; before `start`."""
+        if self._log is None:
+            return
+        self._table.number_from(self._log.first_key)
+        for payload in self._log.recover(lambda: self._table.next_key):
+            try:
+                chunk = decode(Chunk, payload)
+                self._table.insert(chunk)
+            except WireError as error:
+                self._counts["refused"] += 1
+                _LOG.warning("a chunk of the log is left out: %s", error)
+            else:
+                self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
+        self._log.forget(self._table.first_key)
+        self._limiter.resume(self._table.next_key)
 
     def start(self) -> None:
         for thread in self._threads:
@@ -109,6 +139,8 @@ class ReplayService:
             if arrival is Arrival.REPEATED:
                 self._counts["duplicates"] += 1
             elif self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
+                if not self._logged(request, len(chunk)):
+                    return
                 self._table.insert(chunk)
                 self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
                 self._limiter.inserts += len(chunk)
@@ -120,6 +152,21 @@ class ReplayService:
                 return
             total = self._limiter.inserts
         request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
+
+    def _logged(self, request: _Request, num_transitions: int) -> bool:
+        """Whether the request's chunk is in the log; else the request is held."""
+        if self._log is None:
+            return True
+        try:
+            self._log.append(request.payload, self._table.next_key, num_transitions)
+            self._log.forget(self._table.first_key)
+        except OSError as error:
+            self._counts["log_errors"] += 1
+            if self._counts["log_errors"] == 1:
+                _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
+            request.hold(f"replay's log cannot be written: {reason(error)}")
+            return False
+        return True
 
     def _sample(self, request: _Request) -> None:
         size = decode(SampleRequest, request.payload).batch_size

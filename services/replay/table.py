@@ -64,11 +64,23 @@ class Table:
         self._rng = rng
 
     def __len__(self) -> int:
-        return self._next_key - self._first_key
+        return self._next_key - self.first_key
 
     @property
-    def _first_key(self) -> int:
+    def first_key(self) -> int:
+        """Key of the oldest transition; of the next one in an empty table."""
         return self._extents[0].first_key if self._extents else self._next_key
+
+    @property
+    def next_key(self) -> int:
+        """Key of the next transition; transitions ever inserted."""
+        return self._next_key
+
+    def number_from(self, key: int) -> None:
+        """Give the next transition this key; ValueError unless the table is empty."""
+        if len(self):
+            raise ValueError("only an empty table can be numbered anew")
+        self._next_key = key
 
     @property
     def capacity(self) -> int:
@@ -124,7 +136,7 @@ class Table:
         num_transitions = len(self)
         if num_transitions == 0:
             raise ValueError("cannot sample from an empty table")
-        keys = self._first_key + self._rng.integers(0, num_transitions, size)
+        keys = self.first_key + self._rng.integers(0, num_transitions, size)
         slots = keys % self._capacity
         return Samples(
             keys=keys,
@@ -157,7 +169,7 @@ class Table:
 
     def check_invariants(self) -> None:
         """Raise AssertionError where one of the module's invariants does not hold."""
-        key = self._first_key
+        key = self.first_key
         taken = np.zeros(len(self._rows), bool)
         for extent in self._extents:
             if extent.first_key != key:

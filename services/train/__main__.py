@@ -115,7 +115,9 @@ def supervise(
 
 def replay_arguments(run: RunDirectory, endpoint: str) -> list[str]:
     config_path = str(run.path / CONFIG_FILE)
-    return ["--run", run.path.name, "--config", config_path, "--listen", endpoint]
+    run_dir = str(run.path.parent)
+    name = run.path.name
+    return ["--run", name, "--config", config_path, "--listen", endpoint, "--run-dir", run_dir]
 
 
 def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:

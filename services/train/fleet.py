@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from common.config import ENV_PREFIX
 from common.errors import MrcdrlError
 from common.process import DIE_WITH_PARENT
 
@@ -26,6 +27,8 @@ _ALLOCATOR = {
 }
 _TERM_S = 20.0  # until a service that was asked to stop is killed
 _MIN_LIFE_S = 10.0  # a service that fails sooner would fail again
+_LONG_LIFE_S = 300.0  # one that lived so long may be started again as often as at first
+_MAX_RESTARTS = 3
 _STOP_ORDER = ("actor", "evaluator", "learner", "replay")
 
 
@@ -39,11 +42,12 @@ class Service:
     log_path: Path
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
+    restarts: int = 0
     log_read: int = field(default=0)
 
     def start(self) -> None:
         command = [sys.executable, "-m", f"services.{self.role}", *self.arguments]
-        environment = {**_ALLOCATOR, **os.environ, DIE_WITH_PARENT: "1"}
+        environment = {**_ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: "1"}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
                 command,
@@ -78,23 +82,27 @@ class Fleet:
     def watch(self) -> str | None:
         """Start again what crashed; why the run must end, if it must.
 
-        Raises MrcdrlError where a service fails right after its start.
+        Raises MrcdrlError where a service fails right after its start, or again and again.
         """
         for service in self._services:
             code = None if service.process is None else service.process.poll()
             if code is None:
                 continue
             service.process = None
+            lived_s = time.monotonic() - service.started_s
+            if lived_s > _LONG_LIFE_S:
+                service.restarts = 0
             if code == 0:
                 if service.role == "learner":
                     return "the learner has done its steps"
                 _LOG.info("%s was stopped", service.worker)
-            elif time.monotonic() - service.started_s < _MIN_LIFE_S:
+            elif lived_s < _MIN_LIFE_S or service.restarts == _MAX_RESTARTS:
                 raise MrcdrlError(
                     f"{service.worker} failed: {service.last_line()} (log: {service.log_path})"
                 )
             else:
                 _LOG.warning("%s ended with code %d; starting it again", service.worker, code)
+                service.restarts += 1
                 service.start()
         return None
 
@@ -135,3 +143,13 @@ class Fleet:
     def _signal(self, service: Service, number: int) -> None:
         if service.process is not None and service.process.poll() is None:
             service.process.send_signal(number)
+
+
+def resolved_environment() -> dict[str, str]:
+    """This process's environment without settings: they are in the run's config.toml already,
+    where a flag may have overruled them."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not (name.startswith(ENV_PREFIX) and "__" in name)
+    }

@@ -14,10 +14,26 @@ def test_a_plain_name_is_taken(name: str) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["", ".", "..", ".hidden", "-flag", "a/b", "a b", "a*", "**", "a?b", "a#", "$", "é", "a\n", "x" * 65],
+    [
+        "",
+        ".",
+        "..",
+        ".hidden",
+        "-flag",
+        "a/b",
+        "a b",
+        "a*",
+        "**",
+        "a?b",
+        "a#",
+        "$",
+        "é",
+        "a\n",
+        "x" * 65,
+    ],
 )
 def test_a_name_that_would_break_a_key_or_a_path_is_refused(name: str) -> None:
-    with pytest.raises(ConfigError, match="run name .*letter or digit first"):
+    with pytest.raises(ConfigError, match=r"run name .*letter or digit first"):
         Keys(name)
 
 

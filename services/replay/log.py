@@ -1,0 +1,141 @@
+"""The segment log: accepted chunks, appended before they are acknowledged, read back at a start.
+
+    <directory>/<first key, 15 digits>.segment
+    record: length uint32, CRC-32 of the payload uint32 (little-endian), payload (a wire Chunk)
+
+Invariants: a record is whole on the disk's cache when `append` returns, so an acknowledged chunk
+survives kill -9 (with fsync also a power cut); a segment is deleted only when the table has
+evicted all of it; a torn tail is cut off, a corrupt record skipped, and both are reported.
+"""
+
+import logging
+import os
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.errors import RunDirectoryError
+from common.files import reason, sync_directory
+
+_LOG = logging.getLogger("replay")
+_HEADER = struct.Struct("<II")
+_SUFFIX = ".segment"
+
+
+@dataclass(slots=True)
+class _Segment:
+    """A file, and the table's keys of the transitions in it."""
+
+    path: Path
+    first_key: int
+    next_key: int
+
+
+class SegmentLog:
+    """Appends payloads to segments of about `segment_bytes`.
+
+    Raises RunDirectoryError where the directory cannot be written.
+    """
+
+    def __init__(self, directory: Path, *, segment_bytes: int, fsync: bool) -> None:
+        self._directory = directory
+        self._segment_bytes = segment_bytes
+        self._fsync = fsync
+        self._descriptor: int | None = None
+        self._size = 0
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunDirectoryError(f"cannot make {directory}: {reason(error)}") from error
+        self._segments = deque(
+            _Segment(path, int(path.stem), int(path.stem))
+            for path in sorted(directory.glob(f"*{_SUFFIX}"))
+        )
+        self.corrupt = 0
+        """Records skipped because their bytes were not what was written."""
+
+    @property
+    def first_key(self) -> int:
+        """Key of the oldest transition kept; 0 in an empty log."""
+        return self._segments[0].first_key if self._segments else 0
+
+    def recover(self, next_key: Callable[[], int]) -> Iterator[bytes]:
+        """All whole payloads, oldest first; to be exhausted before the first append.
+
+        next_key: key of the transition after those recovered so far.
+        """
+        for segment in self._segments:
+            segment.first_key = next_key()
+            data = segment.path.read_bytes()
+            offset = 0
+            while offset + _HEADER.size <= len(data):
+                length, crc = _HEADER.unpack_from(data, offset)
+                payload = data[offset + _HEADER.size : offset + _HEADER.size + length]
+                if len(payload) < length:
+                    break
+                if zlib.crc32(payload) == crc:
+                    yield payload
+                else:
+                    self.corrupt += 1
+                    _LOG.warning("%s: record at byte %d is corrupt, skipped", segment.path, offset)
+                offset += _HEADER.size + length
+            if offset < len(data):
+                lost = len(data) - offset
+                _LOG.warning("%s: torn tail of %d bytes cut off", segment.path, lost)
+                os.truncate(segment.path, offset)
+            segment.next_key = next_key()
+            self._size = offset
+        if self._segments:
+            self._open(self._segments[-1], self._size)
+
+    def append(self, payload: bytes, first_key: int, num_transitions: int) -> None:
+        """Write one record; raises OSError, and then the record is not in the log."""
+        if self._descriptor is None or self._size >= self._segment_bytes:
+            self._rotate(first_key)
+        record = _HEADER.pack(len(payload), zlib.crc32(payload)) + payload
+        try:
+            self._write(record)
+        except OSError:
+            if self._descriptor is not None:
+                os.ftruncate(self._descriptor, self._size)
+            raise
+        self._size += len(record)
+        self._segments[-1].next_key = first_key + num_transitions
+
+    def forget(self, first_key: int) -> None:
+        """Delete segments whose transitions are all older than `first_key`."""
+        while len(self._segments) > 1 and self._segments[0].next_key <= first_key:
+            self._segments.popleft().path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Bring everything to the disk."""
+        if self._descriptor is not None:
+            os.fsync(self._descriptor)
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _write(self, record: bytes) -> None:
+        if self._descriptor is None:
+            raise ValueError("the log is closed")
+        remaining = memoryview(record)
+        while remaining:
+            remaining = remaining[os.write(self._descriptor, remaining) :]
+        if self._fsync:
+            os.fsync(self._descriptor)
+
+    def _rotate(self, first_key: int) -> None:
+        self.close()
+        after = int(self._segments[-1].path.stem) + 1 if self._segments else 0
+        path = self._directory / f"{max(first_key, after):015d}{_SUFFIX}"
+        segment = _Segment(path, first_key, first_key)
+        self._open(segment, 0)
+        self._segments.append(segment)
+        if self._fsync:
+            sync_directory(self._directory)
+
+    def _open(self, segment: _Segment, size: int) -> None:
+        self._descriptor = os.open(segment.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        self._size = size

@@ -1,0 +1,127 @@
+"""The segment log: what is appended comes back, whatever cuts the writer off."""
+
+import errno
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import RunDirectoryError
+from services.replay.log import SegmentLog
+
+
+def open_log(directory: Path, segment_bytes: int = 100) -> SegmentLog:
+    return SegmentLog(directory, segment_bytes=segment_bytes, fsync=False)
+
+
+def recover(log: SegmentLog, per_payload: int = 10) -> list[bytes]:
+    """All payloads, each standing for `per_payload` transitions."""
+    found: list[bytes] = []
+    first = log.first_key
+    for payload in log.recover(lambda: first + per_payload * len(found)):
+        found.append(payload)
+    return found
+
+
+def write(directory: Path, payloads: Sequence[bytes], first_key: int = 0) -> None:
+    log = open_log(directory)
+    recover(log)
+    for number, payload in enumerate(payloads):
+        log.append(payload, first_key + 10 * number, 10)
+    log.close()
+
+
+def segments(directory: Path) -> list[Path]:
+    return sorted(directory.iterdir())
+
+
+PAYLOADS = [bytes([n]) * 40 for n in range(12)]
+
+
+def test_what_was_appended_comes_back_in_order(tmp_path: Path) -> None:
+    write(tmp_path, PAYLOADS)
+    assert len(segments(tmp_path)) > 1
+    assert recover(open_log(tmp_path)) == PAYLOADS
+
+
+def test_a_reopened_log_goes_on(tmp_path: Path) -> None:
+    write(tmp_path, PAYLOADS[:5])
+    write(tmp_path, PAYLOADS[5:], first_key=50)
+    assert recover(open_log(tmp_path)) == PAYLOADS
+
+
+def test_an_unclosed_log_keeps_every_appended_record(tmp_path: Path) -> None:
+    log = open_log(tmp_path)
+    for number, payload in enumerate(PAYLOADS):
+        log.append(payload, 10 * number, 10)
+    assert recover(open_log(tmp_path)) == PAYLOADS
+    log.close()
+
+
+@settings(max_examples=40, deadline=None)
+@given(cut=st.integers(1, 47))
+def test_a_torn_tail_is_cut_off_and_the_log_goes_on(
+    tmp_path_factory: pytest.TempPathFactory, cut: int
+) -> None:
+    directory = tmp_path_factory.mktemp("log")
+    write(directory, PAYLOADS[:2])
+    (segment,) = segments(directory)
+    os.truncate(segment, segment.stat().st_size - cut)
+    write(directory, [b"new"], first_key=10)
+    assert recover(open_log(directory)) == [PAYLOADS[0], b"new"]
+
+
+def test_a_corrupt_record_is_skipped_counted_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, PAYLOADS)
+    first = segments(tmp_path)[0]
+    data = bytearray(first.read_bytes())
+    data[20] ^= 1
+    first.write_bytes(data)
+    log = open_log(tmp_path)
+    assert recover(log) == PAYLOADS[1:]
+    assert log.corrupt == 1
+    assert f"{first}: record at byte 0 is corrupt" in caplog.text
+
+
+def test_segments_go_when_all_of_them_is_evicted(tmp_path: Path) -> None:
+    log = open_log(tmp_path)
+    for number, payload in enumerate(PAYLOADS):
+        log.append(payload, 10 * number, 10)
+    before = len(segments(tmp_path))
+    log.forget(60)
+    assert len(segments(tmp_path)) < before
+    log.close()
+    kept = recover(open_log(tmp_path))
+    assert kept == PAYLOADS[-len(kept) :]
+    assert set(PAYLOADS[6:]) <= set(kept)
+
+
+def test_a_failed_append_leaves_the_log_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = open_log(tmp_path, segment_bytes=10_000)
+    log.append(PAYLOADS[0], 0, 10)
+    real = os.write
+
+    def full(descriptor: int, data: bytes) -> int:
+        real(descriptor, bytes(data)[:7])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(OSError, match="No space left"):
+        log.append(PAYLOADS[1], 10, 10)
+    monkeypatch.undo()
+    log.append(PAYLOADS[2], 10, 10)
+    log.close()
+    assert recover(open_log(tmp_path)) == [PAYLOADS[0], PAYLOADS[2]]
+
+
+def test_a_directory_that_cannot_be_made_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(RunDirectoryError, match="cannot make"):
+        open_log(tmp_path / "file" / "log")

@@ -1,0 +1,300 @@
+"""The service's answers, with requests and servers in memory."""
+
+import dataclasses
+import queue
+import re
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from common.config import Config, ReplayConfig
+from common.trajectory import Chunk, InsertReply, Samples, Stats
+from common.wire import SampleRequest, decode, encode
+from services.replay.limiter import RateLimiter
+from services.replay.service import ReplayService
+from services.replay.table import Table
+
+_DEADLINE_S = 20.0  # of what is to happen at once
+LENGTH, BATCH = 5, 4
+
+
+@dataclass
+class FakeRequest:
+    """A request whose answer is waited for."""
+
+    payload: bytes
+    arrived_s: float = field(default_factory=time.monotonic)
+    answers: queue.Queue[tuple[str, bytes | str]] = field(default_factory=queue.Queue)
+
+    def reply(self, payload: bytes) -> None:
+        self.answers.put(("reply", payload))
+
+    def refuse(self, reason: str) -> None:
+        self.answers.put(("refuse", reason))
+
+    def hold(self, reason: str) -> None:
+        self.answers.put(("hold", reason))
+
+    def answer(self) -> tuple[str, bytes | str]:
+        return self.answers.get(timeout=_DEADLINE_S)
+
+
+@dataclass
+class WatchfulRequest(FakeRequest):
+    """Notes what the table holds when the acknowledgement comes."""
+
+    table: Table | None = None
+    stored_when_acknowledged: int = -1
+
+    def reply(self, payload: bytes) -> None:
+        assert self.table is not None
+        self.stored_when_acknowledged = len(self.table)
+        super().reply(payload)
+
+
+class FakeServer:
+    """A queue of requests."""
+
+    def __init__(self) -> None:
+        self._waiting: queue.Queue[FakeRequest] = queue.Queue()
+
+    def take(self, timeout_s: float) -> FakeRequest | None:
+        try:
+            return self._waiting.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def ask(self, payload: bytes) -> FakeRequest:
+        return self.put(FakeRequest(payload))
+
+    def put(self, request: FakeRequest) -> FakeRequest:
+        self._waiting.put(request)
+        return request
+
+
+@dataclass
+class Replay:
+    """A service that is up, and the two ways to it."""
+
+    service: ReplayService
+    table: Table
+    inserts: FakeServer
+    samples: FakeServer
+
+    def insert(self, payload: bytes) -> tuple[str, bytes | str]:
+        return self.inserts.ask(payload).answer()
+
+    def sample(self, batch_size: int = BATCH) -> tuple[str, bytes | str]:
+        return self.samples.ask(encode(SampleRequest(batch_size))).answer()
+
+    def fill(self, count: int) -> None:
+        for sequence in range(count):
+            kind, _ = self.insert(chunk_bytes(sequence))
+            assert kind == "reply"
+
+
+@contextmanager
+def replay(
+    *, min_size: int = 10, ratio: float = 0.0, buffer: float = 0.0, hold_s: float = _DEADLINE_S
+) -> Iterator[Replay]:
+    config = Config(replay=ReplayConfig(capacity=1000, min_size=100, hold_s=hold_s))
+    table = Table(1000, 2, 1, 4, np.random.default_rng(0))
+    limiter = RateLimiter(ratio, min_size, buffer, LENGTH, BATCH)
+    inserts, samples = FakeServer(), FakeServer()
+    service = ReplayService(config, table, limiter, inserts, samples)
+    service.start()
+    try:
+        yield Replay(service, table, inserts, samples)
+    finally:
+        service.stop()
+
+
+def chunk(sequence: int, *, actor: str = "a", incarnation: int = 1, length: int = LENGTH) -> Chunk:
+    return Chunk(
+        actor=actor,
+        incarnation=incarnation,
+        sequence=sequence,
+        weights_version=sequence,
+        records=np.full((length + 2, 4), sequence, np.uint8),
+        actions=np.zeros(length, np.uint8),
+        rewards=np.full(length, sequence, np.float32),
+        discounts=np.ones(length, np.float32),
+        bootstrap_offsets=np.ones(length, np.uint8),
+        priorities=np.empty(0, np.float32),
+    )
+
+
+def chunk_bytes(sequence: int, **other: object) -> bytes:
+    return encode(chunk(sequence, **other))  # type: ignore[arg-type]
+
+
+def inserted(answer: tuple[str, bytes | str]) -> InsertReply:
+    kind, payload = answer
+    assert kind == "reply"
+    assert isinstance(payload, bytes)
+    return decode(InsertReply, payload)
+
+
+def test_a_chunk_is_acknowledged_when_it_is_in_the_table() -> None:
+    with replay() as up:
+        request = WatchfulRequest(chunk_bytes(0), table=up.table)
+        up.inserts.put(request)
+        assert inserted(request.answer()) == InsertReply(0, False, LENGTH)
+        assert request.stored_when_acknowledged == LENGTH
+        assert inserted(up.insert(chunk_bytes(1))) == InsertReply(1, False, 2 * LENGTH)
+
+
+def test_a_repeated_chunk_is_acknowledged_and_not_stored_again() -> None:
+    with replay() as up:
+        up.fill(2)
+        assert inserted(up.insert(chunk_bytes(1))) == InsertReply(1, True, 2 * LENGTH)
+        assert inserted(up.insert(chunk_bytes(0))) == InsertReply(0, True, 2 * LENGTH)
+        assert len(up.table) == 2 * LENGTH
+        metrics = up.service.metrics()
+        assert (metrics["chunks"], metrics["duplicates"], metrics["gaps"]) == (2, 2, 0)
+
+
+def test_a_gap_is_stored_and_counted() -> None:
+    with replay() as up:
+        up.fill(1)
+        assert not inserted(up.insert(chunk_bytes(4))).duplicate
+        assert not inserted(up.insert(chunk_bytes(0, incarnation=2))).duplicate
+        metrics = up.service.metrics()
+        assert (metrics["chunks"], metrics["gaps"], metrics["inserts"]) == (3, 1, 3 * LENGTH)
+
+
+REFUSED = {
+    "no message": (b"\x00\x01", "no msgpack|not a map"),
+    "another message": (encode(Stats("a", "b", {})), "'stats/1' where 'chunk/1'"),
+    "another arena": (
+        encode(dataclasses.replace(chunk(0), records=np.zeros((LENGTH + 2, 5), np.uint8))),
+        "another arena or agent",
+    ),
+    "longer than the limiter was told": (
+        chunk_bytes(0, length=LENGTH + 1),
+        "6 transitions where the run's actor.chunk_length is 5",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_chunk_that_does_not_fit_is_refused_counted_and_disturbs_nothing(name: str) -> None:
+    payload, reason = REFUSED[name]
+    with replay() as up:
+        kind, text = up.insert(payload)
+        assert kind == "refuse"
+        assert isinstance(text, str)
+        assert re.search(reason, text)
+        assert up.service.metrics()["refused"] == 1
+        assert len(up.table) == 0
+        assert not inserted(up.insert(chunk_bytes(0))).duplicate
+        assert up.service.healthy
+
+
+@pytest.mark.parametrize("size", [0, -1, BATCH + 1, 2**62])
+def test_a_batch_of_another_size_is_refused(size: int) -> None:
+    with replay(min_size=1) as up:
+        up.fill(1)
+        assert up.sample(size) == ("refuse", f"batch_size {size} is outside 1 ... {BATCH}")
+        assert up.service.metrics()["refused"] == 1
+
+
+def test_samples_are_the_tables_transitions() -> None:
+    with replay(min_size=10) as up:
+        up.fill(2)
+        kind, payload = up.sample()
+        assert kind == "reply"
+        assert isinstance(payload, bytes)
+        samples = decode(Samples, payload)
+        assert samples.table_size == 10
+        np.testing.assert_array_equal(samples.records[:, 0, 0], samples.keys // LENGTH)
+        np.testing.assert_array_equal(samples.rewards, samples.keys // LENGTH)
+        assert up.service.metrics()["samples"] == BATCH
+
+
+def test_a_sample_waits_for_min_size() -> None:
+    with replay(min_size=10) as up:
+        waiting = up.samples.ask(encode(SampleRequest(BATCH)))
+        up.fill(2)
+        assert waiting.answer()[0] == "reply"
+        assert not up.service.metrics()["sample_held"]
+
+
+def test_a_sample_that_waited_too_long_is_held_with_the_reason() -> None:
+    with replay(min_size=10, hold_s=0.05) as up:
+        up.fill(1)
+        assert up.sample() == ("hold", "the table holds 5 of the first 10 transitions")
+        assert up.service.metrics()["sample_held"]
+        assert up.inserts.ask(chunk_bytes(1)).answer()[0] == "reply"
+        assert up.sample()[0] == "reply"
+        assert not up.service.metrics()["sample_held"]
+
+
+def test_samples_wait_for_inserts_once_the_ratio_is_reached() -> None:
+    with replay(min_size=5, ratio=1.0, buffer=5.0, hold_s=0.05) as up:
+        up.fill(1)
+        assert up.sample()[0] == "reply"
+        assert up.sample() == ("hold", "the actors have not inserted enough for another sample yet")
+
+
+def test_inserts_wait_for_samples_once_the_ratio_is_reached() -> None:
+    with replay(min_size=5, ratio=1.0, buffer=5.0) as up:
+        up.fill(2)
+        waiting = up.inserts.ask(chunk_bytes(2))
+        assert up.sample()[0] == "reply"
+        assert up.sample()[0] == "reply"
+        assert inserted(waiting.answer()) == InsertReply(2, False, 15)
+
+
+def test_an_insert_that_waited_too_long_is_held_and_taken_when_asked_again() -> None:
+    with replay(min_size=5, ratio=1.0, buffer=5.0, hold_s=0.05) as up:
+        up.fill(2)
+        kind, reason = up.insert(chunk_bytes(2))
+        assert (kind, reason) == (
+            "hold",
+            "the learner has not sampled enough of what is there yet",
+        )
+        assert len(up.table) == 10
+        metrics = up.service.metrics()
+        assert metrics["insert_held"]
+        assert metrics["chunks"] == 2
+        for _ in range(2):
+            assert up.sample()[0] == "reply"
+        assert inserted(up.insert(chunk_bytes(2))) == InsertReply(2, False, 15)
+        assert not up.service.metrics()["insert_held"]
+
+
+def test_a_request_that_waited_in_the_queue_is_answered_at_once() -> None:
+    with replay(min_size=10, hold_s=3600.0) as up:
+        request = FakeRequest(encode(SampleRequest(BATCH)), time.monotonic() - 3601.0)
+        up.samples.put(request)
+        assert request.answer()[0] == "hold"
+
+
+def test_stop_answers_what_is_held_and_ends_the_threads() -> None:
+    with replay(min_size=10, hold_s=3600.0) as up:
+        assert up.service.healthy
+        held = up.samples.ask(encode(SampleRequest(BATCH)))
+        before = time.monotonic()
+        up.service.stop()
+        assert time.monotonic() - before < _DEADLINE_S
+        assert not up.service.healthy
+        if held.answers.qsize():
+            assert held.answer()[0] == "hold"
+    assert not {"insert", "sample"} & {thread.name for thread in threading.enumerate()}
+
+
+def test_metrics_name_the_table_and_the_limiter() -> None:
+    with replay(min_size=10) as up:
+        up.fill(2)
+        metrics = up.service.metrics()
+    assert metrics["size"] == 10
+    assert metrics["capacity"] == 1000
+    assert metrics["min_size"] == 10
+    assert metrics["bytes"] == up.table.nbytes
+    assert metrics["samples_per_insert"] == 0
