@@ -28,7 +28,7 @@ from common.transport import Publisher, Session
 from common.wire import encode
 
 ENDPOINT_FILE = "endpoint"
-DIE_WITH_PARENT = "MRCDRL_DIE_WITH_PARENT"  # set in the environment by who starts services
+DIE_WITH_PARENT = "MRCDRL_DIE_WITH_PARENT"  # its process id, set by who starts services
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -62,8 +62,11 @@ class StopSignal:
 def run_main(main: Callable[[], int | None]) -> int:
     """Run a command; the exit code. MrcdrlError becomes one line on stderr."""
     logging.basicConfig(level=logging.INFO, format=_LOG_FORMAT, stream=sys.stderr)
-    if os.environ.get(DIE_WITH_PARENT) and sys.platform == "linux":
+    parent = os.environ.get(DIE_WITH_PARENT)
+    if parent and sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != int(parent):  # it was gone before it could be watched
+            return 0
     try:
         return main() or 0
     except MrcdrlError as error:

@@ -6,13 +6,14 @@ is on its way to disk at most one `record_metrics` later; a resumed run appends.
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from common.config import Config
 from common.errors import RunDirectoryError
-from common.files import atomic_write
+from common.files import atomic_write, reason
 from common.trajectory import EpisodeSummary
 from services.dashboard.records import (
     EPISODES,
@@ -100,7 +101,8 @@ class Recorder:
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
         """Writes an episode that `state` has observed."""
         line = episode_line(EpisodeRecord(now, state.learner_steps, episode))
-        self._episodes.write(line)
+        with self._writing():
+            self._episodes.write(line)
         self._event("training/score", episode.score, state.episodes)
         self._event("training/mean_q", episode.mean_q, state.episodes)
         if state.successes_per_100 is not None:
@@ -108,15 +110,17 @@ class Recorder:
 
     def record_evaluation(self, record: EvaluationRecord) -> None:
         """Writes what `state.observe_evaluation` returned."""
-        self._evaluations.write(evaluation_line(record))
-        self._evaluations.flush()
+        with self._writing():
+            self._evaluations.write(evaluation_line(record))
+            self._evaluations.flush()
         for name in EVALUATION_FIELDS:
             value = getattr(record.evaluation, name)
             self._event(f"evaluation/{name}", value, record.evaluation.learner_step)
 
     def record_metrics(self, state: RunState, now: float) -> None:
         """Writes the figures of this second; call it once a second. Flushes all files."""
-        self._metrics.write(to_line(flat_metrics(state, now)))
+        with self._writing():
+            self._metrics.write(to_line(flat_metrics(state, now)))
         for name in RATES:
             self._event(f"rates/{name}_per_s", state.per_second(name, now), int(now))
         for service in state.alive("learner"):
@@ -127,23 +131,33 @@ class Recorder:
     def write_summary(self, state: RunState, now: float, stop_reason: str) -> Path:
         """Writes summary.json in one move; returns its path."""
         path = self.run_dir / SUMMARY
-        atomic_write(path, summary_bytes(state, self._config, now, stop_reason))
+        with self._writing():
+            atomic_write(path, summary_bytes(state, self._config, now, stop_reason))
         return path
 
     def flush(self) -> None:
         """Hands what is buffered to the operating system."""
-        for file in (self._episodes, self._evaluations, self._metrics):
-            file.flush()
+        with self._writing():
+            for file in (self._episodes, self._evaluations, self._metrics):
+                file.flush()
         if self._events is not None:
             self._events.flush()
 
     def close(self) -> None:
         """Flushes and closes; a second call does nothing."""
         for file in (self._episodes, self._evaluations, self._metrics):
-            file.close()
+            with self._writing():
+                file.close()
         if self._events is not None:
             self._events.close()
             self._events = None
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise RunDirectoryError(f"{self.run_dir} cannot be written: {reason(error)}") from error
 
     def _event(self, tag: str, value: float, step: int) -> None:
         if self._events is not None and math.isfinite(value):

@@ -3,6 +3,7 @@
 import logging
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,8 +11,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.live import Live
 
+from common.arena import test_starts
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, TransportConfig, load_config
+from common.errors import EndpointError
 from common.keys import Keys, check_name
 from common.process import StopSignal, available_cores, run_main
 from common.transport import Session, free_endpoint
@@ -24,9 +27,11 @@ from services.train.follower import Follower
 from services.train.rundir import CONFIG_FILE, RunDirectory, default_name
 
 _LOG = logging.getLogger("train")
+_DEFAULT = "quick"
 _TICK_S = 0.25
 _PLAIN_PERIOD_S = 10.0
 _PICTURES_S = 300.0
+_JOIN_S = 60.0
 _ENOUGH_CORES = 4
 
 
@@ -51,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
 def open_run(argv: Sequence[str]) -> RunDirectory:
     """The run that the command line asks for, its folder made or taken up again."""
     parser = Parser(prog="mrcdrl train", description="Train on this machine, all processes.")
-    parser.add_argument("--config", default="quick", help="a preset or a TOML file")
+    parser.add_argument("--config", help=f"a preset or a TOML file; by default {_DEFAULT}")
     parser.add_argument("--robots", metavar="K", help="arena.num_robots")
     parser.add_argument("--minutes", metavar="M", help="run.minutes")
     parser.add_argument("--learner-steps", metavar="N", help="run.learner_steps")
@@ -71,11 +76,25 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
         if getattr(arguments, flag) is not None:
             given[field] = getattr(arguments, flag)
     if arguments.resume:
+        if arguments.name or arguments.config:
+            parser.error("--resume keeps the run's name and configuration: no --name or --config")
         name = check_name(Path(arguments.resume).name, "run name")
         return RunDirectory.resume(arguments.run_dir / name, given)
-    config = load_config(arguments.config, given)
-    name = arguments.name or default_name(arguments.config, config.arena.num_robots)
+    preset = arguments.config or _DEFAULT
+    config = load_config(preset, given)
+    check_possible(config)
+    name = arguments.name or default_name(preset, config.arena.num_robots)
     return RunDirectory.create(arguments.run_dir / check_name(name, "run name"), config)
+
+
+def check_possible(config: Config) -> None:
+    """Refuse, before anything is written, what no service could do.
+
+    Raises ConfigError where the robots do not fit, EndpointError where a port is in use.
+    """
+    test_starts(config.arena, 1, config.evaluator.seed)
+    if config.transport.listen:
+        Session(TransportConfig(listen=config.transport.listen)).close()
 
 
 def supervise(
@@ -85,7 +104,7 @@ def supervise(
     config, keys = run.config, Keys(run.path.name)
     state, rule = RunState(config), StoppingRule(config.run)
     fleet.start("replay", "replay-0", replay_arguments(run, endpoint))
-    with Session(TransportConfig(connect=(endpoint,))) as session:
+    with join(fleet, endpoint) as session:
         run.note_endpoint(endpoint)
         follower = Follower(session, keys, state, recorder, rule)
         for role, count in {
@@ -111,6 +130,18 @@ def supervise(
         follower.listen(_TICK_S)
     recorder.write_summary(state, follower.now, reason)
     return reason
+
+
+def join(fleet: Fleet, endpoint: str) -> Session:
+    """A session with the replay service, or the reason that one ended for."""
+    deadline = time.monotonic() + _JOIN_S
+    while True:
+        try:
+            return Session(TransportConfig(connect=(endpoint,)), open_timeout_s=0.0)
+        except EndpointError:
+            fleet.watch()
+            if time.monotonic() > deadline:
+                raise
 
 
 def replay_arguments(run: RunDirectory, endpoint: str) -> list[str]:

@@ -47,7 +47,7 @@ class Service:
 
     def start(self) -> None:
         command = [sys.executable, "-m", f"services.{self.role}", *self.arguments]
-        environment = {**_ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: "1"}
+        environment = {**_ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: str(os.getpid())}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
                 command,

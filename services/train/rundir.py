@@ -9,6 +9,7 @@ Invariants: a folder that exists is never taken for a new run; two processes nev
 
 import fcntl
 import os
+import shutil
 import time
 from pathlib import Path
 from types import TracebackType
@@ -58,7 +59,11 @@ class RunDirectory:
             ) from error
         except OSError as error:
             raise RunDirectoryError(f"cannot make {path}: {reason(error)}") from error
-        return cls._opened(path, config, resumed=False)
+        try:
+            return cls._opened(path, config, resumed=False)
+        except RunDirectoryError:
+            shutil.rmtree(path, ignore_errors=True)
+            raise
 
     @classmethod
     def resume(cls, path: Path, overrides: dict[str, str]) -> Self:

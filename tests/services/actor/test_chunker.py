@@ -115,15 +115,15 @@ def test_an_episode_shorter_than_n() -> None:
 def test_a_chunk_boundary_repeats_the_history_and_looks_n_ahead() -> None:
     first, second = run([Episode(10, (1, 2, 4, 8, 16), 0.0)], n_step=1, chunk_length=3)
     assert_chunk(first, [10, 10, 10, 10, 11, 12, 13], [1, 2, 4], [0.5] * 3, [1] * 3)
-    assert_chunk(second, [11, 12, 13, 14, 15], [8, 16], [0.5, 0], [1, 1])
+    assert_chunk(second, [10, 11, 12, 13, 14, 15], [8, 16], [0.5, 0], [1, 1])
     assert [first.sequence, second.sequence] == [0, 1]
 
 
 def test_a_chunk_boundary_within_three_step_returns() -> None:
     first, second, third = run([Episode(10, (1, 2, 4, 8, 16), 0.0)], n_step=3, chunk_length=2)
     assert_chunk(first, [10, 10, 10, 10, 11, 12, 13, 14], [3, 6], [0.125] * 2, [3, 3])
-    assert_chunk(second, [10, 11, 12, 13, 14, 15, 15, 15], [12, 16], [0, 0], [3, 2])
-    assert_chunk(third, [12, 13, 14, 15, 15, 15], [16], [0], [1])
+    assert_chunk(second, [10, 10, 11, 12, 13, 14, 15, 15], [12, 16], [0, 0], [3, 2])
+    assert_chunk(third, [11, 12, 13, 14, 15, 15, 15], [16], [0], [1])
 
 
 def test_a_chunk_is_cut_as_soon_as_its_last_return_is_known() -> None:

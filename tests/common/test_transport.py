@@ -1,0 +1,360 @@
+"""Real Zenoh sessions on loopback: every wait ends, every queue's end is as stated."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from common.config import TransportConfig
+from common.errors import DeadlineError, EndpointError, HeldError, RefusedError
+from common.keys import Keys
+from common.process import StopSignal
+from common.trajectory import Weights
+from common.transport import Server, Session, free_endpoint
+from common.weights import WeightsReader, WeightsWriter
+
+_DEADLINE_S = 20.0
+KEY = "mrcdrl/test/query"
+KEYS = Keys("test")
+
+
+class Network:
+    """Opens sessions of one router."""
+
+    def __init__(self, endpoint: str, max_message_bytes: int) -> None:
+        self.endpoint = endpoint
+        self._max_bytes = max_message_bytes
+        self._sessions: list[Session] = []
+
+    def join(self) -> Session:
+        config = TransportConfig(
+            connect=(self.endpoint,), max_message_bytes=self._max_bytes, timeout_s=5.0
+        )
+        session = Session(config)
+        self._sessions.append(session)
+        return session
+
+    def close(self) -> None:
+        for session in reversed(self._sessions):
+            session.close()
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    """The endpoint of a router that all tests here share."""
+    endpoint = free_endpoint()
+    with Session(TransportConfig(listen=(endpoint,))):
+        yield endpoint
+
+
+@pytest.fixture
+def network(router: str) -> Iterator[Network]:
+    opened = Network(router, 1 << 20)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def small_network(router: str) -> Iterator[Network]:
+    opened = Network(router, 1000)
+    yield opened
+    opened.close()
+
+
+def eventually(found: Callable[[], object]) -> None:
+    """Wait, without polling blindly, until it is so; fails at the deadline."""
+    waiter, deadline = threading.Event(), time.monotonic() + _DEADLINE_S
+    while not found():
+        assert time.monotonic() < deadline, "did not happen"
+        waiter.wait(0.01)
+
+
+def answer_next(server: Server, answer: str, text: str) -> bytes:
+    """Take one request, answer it by `reply`, `refuse` or `hold`, and return its payload."""
+    request = server.take(_DEADLINE_S)
+    assert request is not None
+    if answer == "reply":
+        request.reply(text.encode())
+    elif answer == "refuse":
+        request.refuse(text)
+    else:
+        request.hold(text)
+    return request.payload
+
+
+def test_a_query_is_answered_across_the_router(network: Network) -> None:
+    server = network.join().server(KEY)
+    client = network.join().client(KEY, "the peer")
+    with ThreadPoolExecutor(1) as other:
+        taken = other.submit(answer_next, server, "reply", "back")
+        assert client.ask(b"there").result() == b"back"
+        assert taken.result() == b"there"
+
+
+def test_several_queries_may_be_under_way(network: Network) -> None:
+    server = network.join().server(KEY)
+    client = network.join().client(KEY, "the peer")
+    pending = [client.ask(str(number).encode()) for number in range(5)]
+    requests = [server.take(_DEADLINE_S) for _ in pending]
+    for request in reversed(requests):
+        assert request is not None
+        request.reply(request.payload * 2)
+    assert [reply.result() for reply in pending] == [b"00", b"11", b"22", b"33", b"44"]
+
+
+def test_a_refusal_brings_its_reason(network: Network) -> None:
+    server = network.join().server(KEY)
+    client = network.join().client(KEY, "the peer")
+    with ThreadPoolExecutor(1) as other:
+        other.submit(answer_next, server, "refuse", "wrong arena")
+        with pytest.raises(RefusedError, match=r"^the peer refused: wrong arena$") as refused:
+            client.ask(b"").result()
+    assert not isinstance(refused.value, HeldError)
+
+
+def test_a_held_request_is_told_from_a_refused_one(network: Network) -> None:
+    server = network.join().server(KEY)
+    client = network.join().client(KEY, "the peer")
+    with ThreadPoolExecutor(1) as other:
+        other.submit(answer_next, server, "hold", "not yet")
+        with pytest.raises(HeldError, match=r"^not yet$"):
+            client.ask(b"").result()
+
+
+def test_where_nobody_serves_the_answer_is_at_once_a_deadline_error(network: Network) -> None:
+    client = network.join().client(KEY, "the peer", timeout_s=15.0)
+    before = time.monotonic()
+    with pytest.raises(DeadlineError, match="no answer from the peer"):
+        client.ask(b"").result()
+    assert time.monotonic() - before < 10.0
+
+
+def test_a_silent_peer_is_given_up_at_the_timeout(network: Network) -> None:
+    server = network.join().server(KEY)
+    client = network.join().client(KEY, "the peer", timeout_s=0.3)
+    before = time.monotonic()
+    pending = client.ask(b"")
+    request = server.take(_DEADLINE_S)
+    assert request is not None
+    with pytest.raises(DeadlineError, match="no answer from the peer in time"):
+        pending.result()
+    assert 0.2 < time.monotonic() - before < 10.0
+    request.reply(b"too late")  # disturbs nobody
+
+
+def test_a_peer_that_leaves_is_given_up(network: Network) -> None:
+    peer = network.join()
+    server = peer.server(KEY)
+    client = network.join().client(KEY, "the peer", timeout_s=2.0)
+    pending = client.ask(b"")
+    request = server.take(_DEADLINE_S)
+    assert request is not None
+    peer.close()
+    with pytest.raises(DeadlineError, match="no answer from the peer"):
+        pending.result()
+
+
+def test_a_request_that_is_too_large_is_refused(small_network: Network) -> None:
+    server = small_network.join().server(KEY)
+    client = small_network.join().client(KEY, "the peer")
+    with pytest.raises(RefusedError, match="1001 bytes exceed the limit of 1000"):
+        client.ask(b"x" * 1001).result()
+    assert server.refused == 1
+    assert server.take(0.01) is None
+
+
+def test_an_answer_that_is_too_large_is_refused(small_network: Network) -> None:
+    server = small_network.join().server(KEY)
+    client = small_network.join().client(KEY, "the peer")
+    with ThreadPoolExecutor(1) as other:
+        other.submit(answer_next, server, "reply", "x" * 1001)
+        with pytest.raises(RefusedError, match="the answer of the peer exceeds 1000 bytes"):
+            client.ask(b"").result()
+
+
+def test_a_full_server_holds_further_requests(network: Network) -> None:
+    server = network.join().server(KEY, capacity=1)
+    client = network.join().client(KEY, "the peer")
+    first = client.ask(b"first")
+    with pytest.raises(HeldError, match="1 requests are waiting"):
+        client.ask(b"second").result()
+    assert server.refused == 1
+    assert answer_next(server, "reply", "done") == b"first"
+    assert first.result() == b"done"
+
+
+def test_the_latest_subscriber_keeps_the_newest_only(network: Network) -> None:
+    session, other = network.join(), network.join()
+    subscriber = session.latest_subscriber(KEY)
+    marks = session.queue_subscriber("mrcdrl/test/mark")
+    publisher, marker = other.publisher(KEY), other.publisher("mrcdrl/test/mark")
+    for number in range(100):
+        publisher.put(str(number).encode())
+    marker.put(b"")
+    assert marks.take(_DEADLINE_S) is not None  # so all before it have come
+    assert subscriber.take() == b"99"
+    assert subscriber.take() is None
+    assert subscriber.take(0.01) is None
+
+
+def test_the_queue_keeps_the_order_and_counts_what_it_drops(network: Network) -> None:
+    subscriber = network.join().queue_subscriber("mrcdrl/test/queue/*", capacity=10)
+    session = network.join()
+    publisher = session.publisher("mrcdrl/test/queue/a")
+    for number in range(25):
+        publisher.put(bytes([number]))
+    eventually(lambda: subscriber.dropped == 15)
+    assert list(subscriber.drain()) == [("mrcdrl/test/queue/a", bytes([n])) for n in range(10)]
+    publisher.put(b"later")
+    assert subscriber.take(_DEADLINE_S) == ("mrcdrl/test/queue/a", b"later")
+    assert subscriber.take(0.0) is None
+    assert subscriber.take(0.01) is None
+
+
+def test_a_publication_that_is_too_large_is_counted_and_dropped(small_network: Network) -> None:
+    latest = small_network.join().latest_subscriber(KEY)
+    waiting = small_network.join().queue_subscriber(KEY)
+    publisher = small_network.join().publisher(KEY)
+    publisher.put(b"x" * 1001)
+    publisher.put(b"x" * 1000)
+    assert waiting.take(_DEADLINE_S) == (KEY, b"x" * 1000)
+    assert latest.take(_DEADLINE_S) == b"x" * 1000
+    assert (waiting.dropped, latest.oversized) == (1, 1)
+
+
+def test_presence_sees_who_is_there_already_who_comes_and_who_goes(network: Network) -> None:
+    first, second = KEYS.live("actor", "actor-0"), KEYS.live("actor", "actor-1")
+    network.join().announce(first)
+    presence = network.join().presence(KEYS.everyone("actor"))
+    eventually(lambda: presence.alive() == {first})
+    leaver = network.join()
+    leaver.announce(second)
+    network.join().announce(KEYS.live("learner", "learner-0"))
+    eventually(lambda: presence.alive() == {first, second})
+    leaver.close()
+    eventually(lambda: presence.alive() == {first})
+    assert list(presence.changes()) == []
+
+
+def weights(epoch: int, version: int) -> Weights:
+    return Weights(epoch, version, learner_step=10 * version, payload=b"p" * 100)
+
+
+@pytest.fixture
+def writer(network: Network) -> Iterator[WeightsWriter]:
+    opened = WeightsWriter(network.join(), KEYS)
+    yield opened
+    opened.close()
+
+
+def test_who_joins_late_gets_the_newest_weights_soon(
+    network: Network, writer: WeightsWriter
+) -> None:
+    for version in range(3):
+        writer.publish(weights(0, version))
+    reader = WeightsReader(network.join(), KEYS)
+    before = time.monotonic()
+    assert reader.wait(StopSignal()) == weights(0, 2)
+    assert time.monotonic() - before < 1.0
+
+
+def test_who_waits_gets_the_first_weights(network: Network, writer: WeightsWriter) -> None:
+    reader = WeightsReader(network.join(), KEYS)
+    with ThreadPoolExecutor(1) as other:
+        waiting = other.submit(reader.wait, StopSignal())
+        writer.publish(weights(0, 0))
+        assert waiting.result(_DEADLINE_S) == weights(0, 0)
+
+
+def test_waiting_for_weights_ends_when_stopped(network: Network) -> None:
+    reader, stop = WeightsReader(network.join(), KEYS), StopSignal()
+    with ThreadPoolExecutor(1) as other:
+        waiting = other.submit(reader.wait, stop)
+        stop.set()
+        assert waiting.result(_DEADLINE_S) is None
+
+
+@pytest.mark.parametrize("older", [weights(1, 4), weights(1, 5), weights(0, 9)])
+def test_weights_never_go_back(network: Network, writer: WeightsWriter, older: Weights) -> None:
+    reader = WeightsReader(network.join(), KEYS)
+    writer.publish(weights(1, 5))
+    assert reader.wait(StopSignal()) == weights(1, 5)
+    reader.latest(0.2)  # the same, by the subscription
+    writer.publish(older)
+    assert reader.latest(0.2) is None
+    writer.publish(weights(2, 0))
+    assert reader.latest(_DEADLINE_S) == weights(2, 0)
+
+
+def test_foreign_weights_are_counted_and_dropped(network: Network, writer: WeightsWriter) -> None:
+    reader = WeightsReader(network.join(), KEYS)
+    publisher = network.join().publisher(KEYS.weights)
+    publisher.put(b"nonsense")
+    eventually(lambda: reader.latest(0.1) is None and reader.refused == 1)
+    writer.publish(weights(0, 1))
+    assert reader.latest(_DEADLINE_S) == weights(0, 1)
+
+
+def test_a_port_in_use_is_one_line(network: Network) -> None:
+    with pytest.raises(EndpointError, match=r"cannot listen on tcp/127.0.0.1:.* in use") as refused:
+        Session(TransportConfig(listen=(network.endpoint,)))
+    assert "\n" not in str(refused.value)
+
+
+def test_nobody_at_the_endpoint_is_one_line() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(EndpointError, match=f"nobody answers at {endpoint}") as refused:
+        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=0.0)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("side", "endpoint"),
+    [
+        ("listen", "nonsense"),
+        ("listen", "tcp/127.0.0.1"),
+        ("listen", "carrier-pigeon/1:2"),
+        ("connect", "nonsense"),
+    ],
+)
+def test_an_endpoint_that_is_none_is_refused(side: str, endpoint: str) -> None:
+    with pytest.raises(EndpointError, match=endpoint):
+        Session(TransportConfig.model_validate({side: (endpoint,)}), open_timeout_s=0.0)
+
+
+def test_without_an_endpoint_nothing_is_opened() -> None:
+    with pytest.raises(EndpointError, match="give --connect or --listen"):
+        Session(TransportConfig())
+
+
+def test_the_with_block_leaves_neither_session_nor_thread_nor_port() -> None:
+    before = set(threading.enumerate())
+    endpoint = free_endpoint()
+    with (
+        Session(TransportConfig(listen=(endpoint,))) as router,
+        Session(TransportConfig(connect=(endpoint,))) as peer,
+    ):
+        assert "open" in repr(router)
+        router.server(KEY)
+        router.latest_subscriber(KEY)
+        peer.queue_subscriber(KEY)
+        peer.publisher(KEY).put(b"x")
+        peer.presence(KEYS.everyone())
+        peer.announce(KEYS.live("actor", "a"))
+        writer = WeightsWriter(peer, KEYS)
+        writer.close()
+    assert "closed" in repr(router)
+    assert "closed" in repr(peer)
+    router.close()  # again is harmless
+    assert set(threading.enumerate()) <= before
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((host, int(port)), timeout=1.0)
+
+
+def test_a_free_endpoint_is_free() -> None:
+    with Session(TransportConfig(listen=(free_endpoint(),))) as session:
+        assert "open" in repr(session)

@@ -1,0 +1,158 @@
+"""Real processes for the system tests: started, watched, and ended whatever the test does.
+
+Invariants: every process gets a session of its own and is ended by its id; output goes to files,
+so that no pipe fills; every wait has a deadline and says what it waited for.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+BY_HAND_S = 90.0  # a loaded machine takes so long for what takes five seconds on an idle one
+T = TypeVar("T")
+
+# Every part at its smallest: pictures of 32 px, short episodes.
+SMALL = (
+    "--arena.view_px=32",
+    "--arena.max_frames=30",
+    "--learner.precision=float32",
+    "--evaluator.episodes=2",
+    "--learner.checkpoint_period_s=0.5",
+)
+
+
+def run_name(stem: str) -> str:
+    """A name that no other process on this machine bears in its command line."""
+    return f"{stem}-{uuid.uuid4().hex[:12]}"
+
+
+def environment(**more: str) -> dict[str, str]:
+    """This process's environment without settings of mrcdrl's, and more."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("MRCDRL_")}
+    return {**kept, **more}
+
+
+class Command:
+    """`mrcdrl …` as a process; `end` it, or use it in `with`."""
+
+    def __init__(
+        self,
+        arguments: Sequence[str | Path],
+        folder: Path,
+        *,
+        prefix: Sequence[str] = (),
+        terminal: int | None = None,
+        **variables: str,
+    ) -> None:
+        label = uuid.uuid4().hex[:6]
+        self.out_path = folder / f"{arguments[0]}-{label}.out"
+        self.err_path = folder / f"{arguments[0]}-{label}.err"
+        with self.out_path.open("wb") as out, self.err_path.open("wb") as err:
+            self.process = subprocess.Popen(
+                [*prefix, sys.executable, "-m", "services.cli", *map(str, arguments)],
+                stdin=subprocess.DEVNULL if terminal is None else terminal,
+                stdout=out if terminal is None else terminal,
+                stderr=err if terminal is None else terminal,
+                env=environment(**variables),
+                cwd=REPOSITORY,
+                start_new_session=terminal is None,
+            )
+
+    def __enter__(self) -> "Command":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    @property
+    def out(self) -> str:
+        return self.out_path.read_text("utf-8", "replace")
+
+    @property
+    def err(self) -> str:
+        return self.err_path.read_text("utf-8", "replace")
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def wait(self, timeout_s: float = BY_HAND_S) -> int:
+        """The exit code."""
+        return self.process.wait(timeout_s)
+
+    def end(self) -> int:
+        """Ask it to stop, insist after a while."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                return self.process.wait(30)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+        return self.process.wait(30)
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A run of `mrcdrl train` that ended by itself, and what was there after it."""
+
+    name: str
+    path: Path
+    code: int
+    out: str
+    err: str
+    processes_left: dict[int, str]
+    shared_memory_left: set[str]
+
+
+def eventually(look: Callable[[], T | None], what: str, timeout_s: float = BY_HAND_S) -> T:
+    """What `look` returns as soon as that is true; fails after the time."""
+    pause = threading.Event()
+    deadline = time.monotonic() + timeout_s
+    while not (found := look()):
+        if time.monotonic() > deadline:
+            raise AssertionError(f"in {timeout_s:g} s not: {what}")
+        pause.wait(0.05)
+    return found
+
+
+def processes_of(*words: str) -> dict[int, str]:
+    """Process id to command line of those that have all words in theirs, this one left out."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit() or int(entry.name) == os.getpid():
+            continue
+        try:
+            line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode("utf-8", "replace")
+        except OSError:
+            continue
+        if all(word in line for word in words):
+            found[int(entry.name)] = line
+    return found
+
+
+def end_all(name: str) -> None:
+    """Kill what a failed test left of a run."""
+    for pid in processes_of(name):
+        os.kill(pid, signal.SIGKILL)
+
+
+def shared_memory_files() -> set[str]:
+    return {entry.name for entry in Path("/dev/shm").iterdir()}
+
+
+def error_line(stderr: str) -> str:
+    """The one line that says what is wrong; log lines with a time before it may stand above."""
+    assert "Traceback" not in stderr, stderr
+    lines = [line for line in stderr.splitlines() if not re.match(r"\d{4}-\d\d-\d\d ", line)]
+    assert len(lines) == 1, stderr
+    assert lines[0].startswith("mrcdrl: "), stderr
+    return lines[0]

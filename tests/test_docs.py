@@ -1,0 +1,344 @@
+"""The docs say what the code does: every setting, key, message, metric and command is in them."""
+
+import ast
+import importlib
+import importlib.util
+import inspect
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+
+from common.config import Config, TransportConfig, preset_names
+from common.keys import Keys
+from common.network import QNetwork, weights_to_bytes
+from common.trajectory import (
+    Chunk,
+    EpisodeSummary,
+    Evaluation,
+    InsertReply,
+    Outcome,
+    Samples,
+    Stats,
+    Weights,
+)
+from common.transport import Session, free_endpoint
+from common.wire import SampleRequest, encode
+from services import cli
+from services.dashboard.recorder import EVALUATION_FIELDS, RATES, flat_metrics
+from services.dashboard.records import EpisodeRecord, EvaluationRecord
+from services.dashboard.state import RunState
+from services.dashboard.summary import summary
+from services.learner.meter import Meter
+from services.replay.__main__ import build
+from services.replay.service import ReplayService
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+README = (ROOT / "README.md").read_text("utf-8")
+MESSAGES = (
+    Chunk,
+    InsertReply,
+    SampleRequest,
+    Samples,
+    Weights,
+    EpisodeSummary,
+    Evaluation,
+    Stats,
+)
+
+
+def page(name: str) -> str:
+    return (DOCS / name).read_text("utf-8")
+
+
+def part(text: str, heading: str) -> str:
+    """What stands below a heading, down to the next of its level or above."""
+    level = heading.split(" ")[0]
+    found = re.search(
+        rf"^{re.escape(heading)}$(.*?)(?=^#{{1,{len(level)}}} |\Z)", text, re.M | re.S
+    )
+    assert found, f"no heading {heading!r}"
+    return found[1]
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of the tables' rows whose first cell is `a name`."""
+    return [
+        [cell.strip() for cell in line.strip("|").split(" | ")]
+        for line in text.splitlines()
+        if line.startswith("| `")
+    ]
+
+
+def names(text: str) -> list[str]:
+    return [row[0].strip("` ") for row in rows(text)]
+
+
+# -- configuration ----------------------------------------------------------------------
+
+
+def generate() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_configuration_is_up_to_date() -> None:
+    assert page("configuration.md") == generate().render(), "run: python docs/generate.py"
+
+
+def test_settings_named_in_the_docs_exist() -> None:
+    known = {f"{s}.{f}" for s, info in Config.model_fields.items() for f in _fields(info)}
+    sections = "|".join(Config.model_fields)
+    for name in ("README.md", *(f"docs/{p.relative_to(DOCS)}" for p in DOCS.rglob("*.md"))):
+        text = (ROOT / name).read_text("utf-8")
+        for found in re.findall(rf"(?:`|--)((?:{sections})\.[a-z]\w*)(?=[` ]|$)", text):
+            assert found in known or (ROOT / found).exists(), f"{name}: {found}"
+
+
+def _fields(info: Any) -> list[str]:
+    return list(info.annotation.model_fields)
+
+
+def test_presets_are_in_the_readme() -> None:
+    assert set(preset_names()) <= set(names(part(README, "## Settings")))
+
+
+# -- wire --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.__name__)
+def test_message_is_documented(message: type) -> None:
+    section = part(page("wire.md"), f"### {message.__name__}")
+    hints = get_type_hints(message)
+    expected = [(field.name, wire_type(hints[field.name])) for field in fields(message)]
+    documented = [(row[0].strip("`"), row[1].strip("`")) for row in rows(section)]
+    assert documented == expected
+
+
+def test_schemas_are_documented() -> None:
+    from common.wire import _SCHEMAS
+
+    assert set(_SCHEMAS) == set(MESSAGES), "a message is missing in this test"
+    for message, schema in _SCHEMAS.items():
+        assert f"Schema `{schema}`" in part(page("wire.md"), f"### {message.__name__}")
+
+
+def wire_type(hint: Any) -> str:
+    """As docs/wire.md writes it."""
+    if get_origin(hint) is np.ndarray:
+        return np.dtype(get_args(get_args(hint)[1])[0]).name
+    if get_origin(hint) is tuple:
+        return f"[{', '.join(wire_type(a) for a in get_args(hint))}]"
+    if get_origin(hint) is dict:
+        return f"map of {wire_type(get_args(hint)[1])}"
+    return "str" if hint is Outcome else str(hint.__name__)
+
+
+def key_expressions() -> Iterator[str]:
+    keys = Keys("RUN")
+    values = {"shard": "SHARD", "worker": "WORKER", "actor": "WORKER", "role": "ROLE"}
+    for name, member in vars(Keys).items():
+        if isinstance(member, property):
+            yield getattr(keys, name)
+        elif inspect.isfunction(member) and not name.startswith("_"):
+            parameters = list(inspect.signature(member).parameters)[1:]
+            yield member(keys, *(values[p] for p in parameters))
+
+
+@pytest.mark.parametrize("key", sorted({k for k in key_expressions() if "*" not in k}))
+def test_key_is_documented(key: str) -> None:
+    shown = re.sub(r"\b(RUN|SHARD|WORKER|ROLE)\b", lambda m: f"<{m[0].lower()}>", key)
+    if shown.endswith("/*"):
+        pytest.skip("a wildcard")
+    assert shown in names(part(page("wire.md"), "## Keys"))
+
+
+def test_example_subscriber_runs(tmp_path: Path) -> None:
+    example = tmp_path / "watch.py"
+    found = re.search(r"```python\n(.*?)```", page("wire.md"), re.S)
+    assert found
+    example.write_text(found[1], "utf-8")
+    endpoint, keys = free_endpoint(), Keys("documented")
+    weights = Weights(7, 3, 100, weights_to_bytes(QNetwork("dqn")))
+    test = Evaluation("e", 7, 3, 100, 2, 10, 0.5, 0.5, 0, (0.2, 0.8), 5, 5, 0, 9, 1, 0, 1)
+    with Session(TransportConfig(listen=(endpoint,))) as session:
+        process = subprocess.Popen(
+            [sys.executable, str(example), endpoint, keys.run],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        lines: list[str] = []
+        both = threading.Event()
+
+        def read() -> None:
+            assert process.stdout is not None
+            for line in process.stdout:
+                lines.append(line)
+                if {line.split()[0] for line in lines} >= {"weights", "evaluation"}:
+                    both.set()
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        try:
+            weights_out = session.publisher(keys.weights)
+            tests_out = session.publisher(keys.evaluation("e"))
+            for _ in range(150):  # until the example has subscribed
+                weights_out.put(encode(weights))
+                tests_out.put(encode(test))
+                if both.wait(0.1):
+                    break
+        finally:
+            process.terminate()
+            process.wait(10)
+            reader.join(10)
+            if process.stdout is not None:
+                process.stdout.close()
+    assert both.is_set(), "".join(lines)
+    assert any(line.startswith("weights 3 ") and '"kind": "dqn"' in line for line in lines)
+    assert "evaluation 3 0.5\n" in lines
+
+
+# -- metrics -----------------------------------------------------------------------------
+
+METRICS_OF = {
+    "services/actor/__main__.py": "actor",
+    "services/replay/service.py": "replay",
+    "services/learner/meter.py": "learner",
+    "services/evaluator/__main__.py": "evaluator",
+}
+
+
+def functions_that_tell(path: Path) -> list[ast.FunctionDef]:
+    tree = ast.parse(path.read_text("utf-8"))
+    return [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and node.name in ("metrics", "_metrics")
+    ]
+
+
+def literal_keys(path: str) -> set[str]:
+    """Constant keys of the dictionaries that a service's metrics are made of."""
+    return {
+        key.value
+        for function in functions_that_tell(ROOT / path)
+        for node in ast.walk(function)
+        if isinstance(node, ast.Dict)
+        for key in node.keys
+        if isinstance(key, ast.Constant) and isinstance(key.value, str)
+    }
+
+
+def published(role: str) -> set[str]:
+    """Names of a role's metrics: told by the code where that is cheap, read in it elsewhere."""
+    if role == "replay":
+        config, silent = Config(), SimpleNamespace(take=lambda _: None)
+        return set(ReplayService(config, *build(config), silent, silent).metrics())
+    if role == "learner":
+        meter = Meter(
+            SimpleNamespace(learner_step=1),  # type: ignore[arg-type]
+            SimpleNamespace(ready=0, decode_s=0.0),  # type: ignore[arg-type]
+            SimpleNamespace(version=1, epoch=1),  # type: ignore[arg-type]
+        )
+        ones = np.ones(1)
+        meter.last = SimpleNamespace(  # type: ignore[assignment]
+            loss=1.0, td_errors=np.abs(ones), mean_q=1.0, gradient_norm=1.0
+        )
+        meter.last.td_errors = SimpleNamespace(abs=lambda: ones)  # type: ignore[misc]
+        return set(meter.metrics())
+    return literal_keys(next(path for path, of in METRICS_OF.items() if of == role))
+
+
+@pytest.mark.parametrize("role", METRICS_OF.values())
+def test_metrics_are_documented(role: str) -> None:
+    assert set(names(part(page("metrics.md"), f"## {role}"))) == published(role)
+
+
+def test_no_other_service_publishes_metrics() -> None:
+    telling = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "services").rglob("*.py")
+        if functions_that_tell(path)
+    }
+    assert telling == set(METRICS_OF)
+
+
+def test_run_files_are_documented() -> None:
+    text, state, config = page("metrics.md"), RunState(Config()), Config()
+    assert names(part(text, "## metrics.jsonl"))[:-1] == list(flat_metrics(state, 0.0))
+    assert names(part(text, "## summary.json")) == list(summary(state, config, 0.0, "test"))
+    for heading, record in (
+        ("## episodes.jsonl", EpisodeRecord),
+        ("## evaluations.jsonl", EvaluationRecord),
+    ):
+        assert names(part(text, heading)) == [field.name for field in fields(record)][:-1]
+
+
+def test_tensorboard_tags_are_documented() -> None:
+    tree = ast.parse((ROOT / "services/dashboard/recorder.py").read_text("utf-8"))
+    tags = {f"evaluation/{name}" for name in EVALUATION_FIELDS}
+    tags |= {f"rates/{name}_per_s" for name in RATES} | {"learner/METRIC"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "_event":
+            tag = node.args[0]
+            if isinstance(tag, ast.Constant):
+                tags.add(str(tag.value))
+            else:
+                assert ast.unparse(tag)[2:].split("/")[0] in {"evaluation", "rates", "learner"}
+    assert set(names(part(page("metrics.md"), "## TensorBoard"))) == tags
+
+
+# -- commands ----------------------------------------------------------------------------
+
+
+def test_every_command_is_in_the_readme() -> None:
+    described = {name.split()[1] for name in names(part(README, "## Commands"))}
+    assert described == set(cli._COMMANDS)
+
+
+def command_lines() -> list[str]:
+    """Lines of the README that begin with mrcdrl, in blocks of shell."""
+    blocks = re.findall(r"```sh\n(.*?)```", README, re.S)
+    return [line for block in blocks for line in block.splitlines() if line.startswith("mrcdrl ")]
+
+
+@pytest.mark.parametrize("line", command_lines())
+def test_command_and_its_flags_exist(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    name = line.split()[1]
+    assert name in cli._COMMANDS
+    command = importlib.import_module(cli._COMMANDS[name][0])
+    with pytest.raises(SystemExit) as ended:
+        command.main(["--help"])
+    assert ended.value.code == 0
+    known = set(re.findall(r"--[a-z][\w.-]*", capsys.readouterr().out))
+    assert set(re.findall(r"--[a-z][\w.-]*", line)) <= known
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    targets = set(re.findall(r"^([a-z]+):", makefile, re.M))
+    named = set(re.findall(r"(?:^|`)make ([a-z]+)", README, re.M))
+    assert {"train", "test"} <= named <= targets
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=str)
+def test_links_and_files_exist(path: Path) -> None:
+    text = path.read_text("utf-8")
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert target.startswith("https://") or (path.parent / target).exists(), target
+    for named in re.findall(r"`((?:common|services|configs|docs)/[\w/.]+)`", text):
+        assert (ROOT / named).exists(), named
