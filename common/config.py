@@ -251,7 +251,7 @@ class EvaluatorConfig(Section):
     """(paper)"""
     period_s: Annotated[float, Field(ge=0)] = 30.0
     """From the start of one evaluation to the next at the earliest. (ours)"""
-    max_share: Annotated[float, Field(gt=0, le=1)] = 0.25
+    max_share: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Share of the time spent judging at most: a wandering policy takes long to judge. (ours)"""
     seed: int = 1
     """Of the start states: the same for every version. (ours)"""

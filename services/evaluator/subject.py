@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from common.arena import controller, make_codec
 from common.arguments import Parser, add_config_flags, overrides
@@ -67,6 +68,7 @@ def subject(arguments: argparse.Namespace) -> Subject:
     path = weights_path(arguments.weights)
     config = load_config(arguments.config or _config_beside(path), given)
     payload, manifest = read_weights(path)
+    torch.set_num_threads(config.evaluator.threads)
     network = network_from_bytes(payload, compute_dtype=precision(config.learner.precision))
     if (network.stack, network.view_px) != (config.arena.stack, config.arena.view_px):
         raise CheckpointError(
