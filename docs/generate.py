@@ -39,7 +39,8 @@ the file, which beats the default below:
   `runs/NAME/config.toml`; `--resume` reads it there.
 - A process that joins a run takes the run's configuration from the replay service, and over it
   its own flags. `[transport]` is the exception: it is about one process, and a process that joins
-  takes it from its own environment and flags.
+  takes it from its own environment and flags. Those that `mrcdrl train` starts, replay apart, run
+  with its defaults.
 
 *Source* says where a default comes from: *paper* (the publication, docs/paper.md), *ancestor* (the
 pymunk car game that the paper's environment descends from), *Ape-X* or *dueling paper* (those

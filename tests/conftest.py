@@ -2,4 +2,8 @@
 
 import os
 
+from hypothesis import settings
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+settings.register_profile("shared cores", deadline=None)  # a wait for a core is no slow example
+settings.load_profile("shared cores")

@@ -1,0 +1,82 @@
+"""The best weights are kept, over restarts too."""
+
+from pathlib import Path
+
+import pytest
+
+from common.errors import CheckpointError
+from common.files import read_weights
+from common.trajectory import Evaluation, Weights
+from services.evaluator.__main__ import Best
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "checkpoints" / "best.safetensors"
+
+
+def offer(best: Best, version: int, rate: float, frames: float) -> None:
+    result = Evaluation(
+        worker="evaluator-0",
+        weights_epoch=0,
+        weights_version=version,
+        learner_step=10 * version,
+        num_robots=2,
+        episodes=100,
+        success_rate=rate,
+        collision_rate=1 - rate,
+        timeout_rate=0.0,
+        success_interval=(0.0, 1.0),
+        max_per_100=100 * rate,
+        mean_per_100=100 * rate,
+        variance_per_100=0.0,
+        mean_frames=frames,
+        mean_score=0.0,
+        seed=1,
+        wall_s=1.0,
+    )
+    best.offer(Weights(0, version, 10 * version, f"weights {version}".encode()), result)
+
+
+def kept(path: Path) -> str:
+    payload, manifest = read_weights(path)
+    assert payload == f"weights {manifest['weights_version']}".encode()
+    return payload.decode()
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+@pytest.mark.parametrize(
+    ("offers", "expected"),
+    [
+        ([(0.0, 0)], 0),
+        ([(0.0, 0), (0.0, 0)], 0),
+        ([(0.5, 90), (0.6, 200)], 1),
+        ([(0.5, 90), (0.4, 10)], 0),
+        ([(0.5, 90), (0.5, 80)], 1),
+        ([(0.5, 90), (0.5, 90)], 0),
+        ([(0.5, 90), (0.5, 100)], 0),
+        ([(0.1, 9), (0.9, 50), (0.8, 5), (0.9, 60)], 1),
+    ],
+)
+def test_more_successes_or_as_many_in_less_time_are_kept(
+    path: Path, offers: list[tuple[float, float]], expected: int, restarts: bool
+) -> None:
+    best = Best(path)
+    for version, (rate, frames) in enumerate(offers):
+        offer(best, version, rate, frames)
+        best = Best(path) if restarts else best
+    assert kept(path) == f"weights {expected}"
+
+
+def test_of_kept_weights_nothing_is_known_where_the_file_beside_is_torn(path: Path) -> None:
+    offer(Best(path), 0, 0.9, 50)
+    path.with_suffix(".json").write_text("{")
+    offer(Best(path), 1, 0.1, 50)
+    assert kept(path) == "weights 1"
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("a file in its place")
+    best = Best(tmp_path / "checkpoints" / "best.safetensors")
+    with pytest.raises(CheckpointError, match="not written"):
+        offer(best, 0, 0.5, 50)

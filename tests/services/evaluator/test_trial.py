@@ -1,0 +1,145 @@
+"""The paper's test: given starts, one collision is failure, the same seed the same result."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from common.arena import (
+    LEFT,
+    STRAIGHT,
+    Scene,
+    Start,
+    controller,
+    layout_for,
+    make_codec,
+    test_starts,
+)
+from common.config import ArenaConfig
+from common.network import QNetwork
+from common.policy import Policy
+from common.trajectory import Outcome, TimeStep, UInt8Array
+from services.evaluator.trial import ControllerPlayer, EpisodeResult, PolicyPlayer, play
+
+CONFIG = ArenaConfig(num_robots=2, view_px=32, max_frames=150)
+starts_of = test_starts  # else pytest takes it for a test
+del test_starts
+
+
+class SteadyPlayer:
+    """Every robot takes the same action always; notes what it is told."""
+
+    def __init__(self, action: int) -> None:
+        self._action = action
+        self.begun: list[int] = []
+        self.observed: list[tuple[int, ...]] = []
+
+    def begin(self, arena: int, time_step: TimeStep) -> None:
+        assert time_step.first
+        self.begun.append(arena)
+
+    def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
+        assert len(arenas) == len(scenes)
+        return np.full((len(arenas), CONFIG.num_robots), self._action, np.uint8)
+
+    def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
+        self.observed.append(records.shape)
+
+
+def controlled(name: str, epsilon: float = 0.0, seed: int = 0) -> ControllerPlayer:
+    rng = np.random.default_rng(seed)
+    return ControllerPlayer(controller(name, CONFIG, rng), epsilon, rng)
+
+
+def by_policy(epsilon: float) -> PolicyPlayer:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = QNetwork("dqn", view_px=CONFIG.view_px)
+    rng = np.random.default_rng(4)
+    return PolicyPlayer(CONFIG, make_codec(CONFIG), Policy(network), epsilon, rng)
+
+
+def outcomes(results: Sequence[EpisodeResult] | None) -> list[tuple[Outcome, int, float]]:
+    assert results is not None
+    return [(r.outcome, r.frames, r.score) for r in results]
+
+
+def start(*robots: tuple[float, float, float]) -> Start:
+    return Start(np.array(robots), layout_for(CONFIG, np.random.default_rng(0)))
+
+
+TOWARDS = start((300, 300, 0), (360, 300, np.pi))  # collide at once, going straight
+APART = start((100, 300, -np.pi / 2), (500, 300, -np.pi / 2))
+
+
+def test_one_collision_ends_the_episode() -> None:
+    (result,) = play(CONFIG, [TOWARDS], SteadyPlayer(STRAIGHT)) or []
+    assert result.outcome is Outcome.COLLISION
+    assert result.frames < 5
+    assert CONFIG.max_collisions == 5
+
+
+def test_results_come_in_the_order_of_the_starts() -> None:
+    starts = [TOWARDS, APART] * 40  # more than are played at once
+    results = outcomes(play(CONFIG, starts, SteadyPlayer(STRAIGHT)))
+    assert results[0][1] < results[1][1]  # frames
+    assert results == results[:2] * 40
+
+
+def test_a_time_out_is_at_the_last_frame() -> None:
+    (result,) = play(CONFIG, [APART], SteadyPlayer(LEFT)) or []
+    assert (result.outcome, result.frames) == (Outcome.TIMEOUT, CONFIG.max_frames)
+
+
+def test_the_player_is_told_of_every_start_and_step() -> None:
+    player = SteadyPlayer(LEFT)
+    play(CONFIG, [APART] * 3, player)
+    assert player.begun == [0, 1, 2]
+    assert player.observed == [(3, 2, CONFIG.record_bytes)] * CONFIG.max_frames
+
+
+def test_the_same_seed_gives_the_same_results() -> None:
+    starts = starts_of(CONFIG, 6, seed=1)
+    first, second = (play(CONFIG, starts, by_policy(0.3)) for _ in range(2))
+    assert outcomes(first) == outcomes(second)
+    third, fourth = (play(CONFIG, starts, controlled("greedy", 0.3, seed=2)) for _ in range(2))
+    assert outcomes(third) == outcomes(fourth)
+
+
+def test_the_greedy_controller_succeeds_more_often_than_the_random_one() -> None:
+    starts = starts_of(CONFIG, 40, seed=3)
+    wins = {
+        name: sum(o is Outcome.SUCCESS for o, _, _ in outcomes(play(CONFIG, starts, player)))
+        for name, player in (("greedy", controlled("greedy")), ("random", controlled("random")))
+    }
+    assert wins["greedy"] > wins["random"] + 5
+
+
+@pytest.mark.parametrize("keep_paths", [True, False])
+def test_paths_are_kept_where_asked_for(keep_paths: bool) -> None:
+    (result,) = play(CONFIG, [TOWARDS], SteadyPlayer(STRAIGHT), keep_paths=keep_paths) or []
+    if not keep_paths:
+        assert len(result.robots) == 0
+        return
+    assert result.robots.shape == (result.frames + 1, 2, 3)
+    np.testing.assert_allclose(result.robots[0], TOWARDS.robots)
+    np.testing.assert_allclose(result.targets, TOWARDS.targets)
+
+
+def test_no_starts_no_results() -> None:
+    assert play(CONFIG, [], SteadyPlayer(LEFT)) == []
+
+
+def test_it_ends_when_told_to_and_says_how_far_it_is() -> None:
+    told: list[int] = []
+
+    def go_on(done: int) -> bool:
+        told.append(done)
+        return done < 2
+
+    starts = [TOWARDS, TOWARDS, APART]
+    assert play(CONFIG, starts, SteadyPlayer(STRAIGHT), go_on=go_on) is None
+    assert told[0] == 0
+    assert told[-1] == 2

@@ -1,0 +1,195 @@
+"""The fleet with real processes: small ones, in place of the services' modules."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from common.errors import MrcdrlError
+from services.train import fleet as fleet_module
+from services.train.fleet import Fleet
+
+_DEADLINE_S = 60.0
+
+# `python -m services.actor` runs this when it is started beside a folder that holds it.
+_WAITS = """
+import os, signal, sys
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+print("2026-11-22 10:00:00,000 INFO actor: up as", *sys.argv[1:], flush=True)
+print("2026-11-22 10:00:01,000 WARNING actor: replay is late", flush=True)
+open(os.environ["READY"], "w").write(str(os.getpid()))
+while True:
+    signal.pause()
+"""
+_DEAF = _WAITS.replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
+_FAILS = "import sys; sys.exit('mrcdrl: no such arena')"
+_ENDS = ""
+
+
+@pytest.fixture
+def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that processes are started in; its `ready` is a pipe that they write to."""
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo(tmp_path / "ready")
+    monkeypatch.setenv("READY", str(tmp_path / "ready"))
+    (tmp_path / "services").mkdir()
+    (tmp_path / "services" / "__init__.py").touch()
+    return tmp_path
+
+
+@pytest.fixture
+def fleet(beside: Path) -> Iterator[Fleet]:
+    started = Fleet(beside)
+    yield started
+    started.stop()
+
+
+def put(beside: Path, role: str, code: str) -> None:
+    """Have `services.<role>` be this code."""
+    (beside / "services" / f"{role}.py").write_text(code)
+
+
+def ready(beside: Path) -> int:
+    """Wait until a process is up; its id."""
+    with (beside / "ready").open() as pipe:
+        return int(pipe.read())
+
+
+def ended(pid: int) -> bool:
+    """Whether no process has this id (ours are reaped when they have ended)."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def watch_until_ended(fleet: Fleet) -> str | None:
+    """`watch`, once the only service has ended; it stays to be reaped until then."""
+    (service,) = fleet._services
+    assert service.process is not None
+    os.waitid(os.P_PID, service.process.pid, os.WEXITED | os.WNOWAIT)
+    return fleet.watch()
+
+
+def test_services_run_and_have_ended_when_stop_returns(beside: Path, fleet: Fleet) -> None:
+    for role in ("actor", "replay"):
+        put(beside, role, _WAITS)
+    pids = []
+    for role in ("replay", "actor"):
+        fleet.start(role, f"{role}-0", ["--run", "r"])
+        pids.append(ready(beside))
+    assert fleet.watch() is None
+    assert not any(ended(pid) for pid in pids)
+    assert len({os.getsid(pid) for pid in (os.getpid(), *pids)}) == 3
+    fleet.stop()
+    assert all(ended(pid) for pid in pids)
+    assert "up as --run r" in (beside / "actor-0.log").read_text()
+    fleet.stop()  # again is harmless
+
+
+def test_who_feeds_is_stopped_before_who_is_fed(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    await_ended = Fleet._await
+
+    def watched(self: Fleet, service: fleet_module.Service) -> None:
+        await_ended(self, service)
+        order.append(service.role)
+
+    monkeypatch.setattr(Fleet, "_await", watched)
+    for role in ("replay", "learner", "actor"):
+        put(beside, role, _WAITS)
+        fleet.start(role, f"{role}-0", [])
+        ready(beside)
+    fleet.stop()
+    assert order == ["actor", "learner", "replay"]
+
+
+def test_a_service_that_is_deaf_is_killed(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_TERM_S", 0.2)
+    put(beside, "actor", _DEAF)
+    fleet.start("actor", "actor-0", [])
+    pid = ready(beside)
+    fleet.stop()
+    assert ended(pid)
+
+
+def test_a_service_that_fails_at_once_ends_the_run_with_its_reason(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", _DEADLINE_S)
+    put(beside, "actor", _FAILS)
+    fleet.start("actor", "actor-0", [])
+    with pytest.raises(MrcdrlError, match=r"actor-0 failed: mrcdrl: no such arena .log: .*actor-0"):
+        watch_until_ended(fleet)
+
+
+def test_a_service_that_was_killed_is_started_again(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
+    put(beside, "actor", _WAITS)
+    fleet.start("actor", "actor-0", ["--id", "actor-0"])
+    first = ready(beside)
+    os.kill(first, signal.SIGKILL)
+    assert watch_until_ended(fleet) is None
+    second = ready(beside)
+    assert second != first
+    assert not ended(second)
+    assert (beside / "actor-0.log").read_text().count("up as --id actor-0") == 2
+
+
+def test_a_service_that_ends_again_and_again_ends_the_run(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
+    monkeypatch.setattr(fleet_module, "_MAX_RESTARTS", 1)
+    put(beside, "actor", _FAILS)
+    fleet.start("actor", "actor-0", [])
+    assert watch_until_ended(fleet) is None
+    with pytest.raises(MrcdrlError, match="actor-0 failed"):
+        watch_until_ended(fleet)
+
+
+@pytest.mark.parametrize(
+    ("role", "reason"), [("learner", "the learner has done its steps"), ("actor", None)]
+)
+def test_a_learner_that_ends_well_ends_the_run(
+    beside: Path, fleet: Fleet, role: str, reason: str | None
+) -> None:
+    put(beside, role, _ENDS)
+    fleet.start(role, f"{role}-0", [])
+    assert watch_until_ended(fleet) == reason
+    assert fleet.watch() is None
+
+
+def test_warnings_in_the_logs_are_told_once(beside: Path, fleet: Fleet) -> None:
+    (beside / "actor-0.log").write_text("before: 1 WARNING actor: of an earlier start\n")
+    put(beside, "actor", _WAITS)
+    fleet.start("actor", "actor-0", [])
+    ready(beside)
+    assert list(fleet.warnings()) == ["actor-0: replay is late"]
+    assert list(fleet.warnings()) == []
+    with (beside / "actor-0.log").open("a") as log:
+        log.write("10:00 ERROR actor: not whole")
+        log.flush()
+        assert list(fleet.warnings()) == []
+        log.write(" yet\n")
+    assert list(fleet.warnings()) == ["actor-0: not whole yet"]
+
+
+def test_settings_in_the_environment_are_not_handed_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MRCDRL_LEARNER__SEED", "1")
+    monkeypatch.setenv("MRCDRL_DIE_WITH_PARENT", "1")
+    environment = fleet_module.resolved_environment()
+    assert "MRCDRL_LEARNER__SEED" not in environment
+    assert environment["MRCDRL_DIE_WITH_PARENT"] == "1"
+    assert environment["PATH"] == os.environ["PATH"]
