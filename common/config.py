@@ -79,7 +79,7 @@ class ArenaConfig(Section):
     """Frames after which r_f is 0. (ours: the paper names f_max, not its value)"""
     max_frames: Count = 1000
     """Frames after which an episode is truncated (and bootstrapped). (ours)"""
-    view_px: Annotated[int, Field(ge=12, le=255)] = 60
+    view_px: Annotated[int, Field(ge=31, le=255)] = 60
     """Width and height of a robot's picture. (paper)"""
     crop_px: Positive = 600
     """w = h of the rectangle cut out around the robot. (ours: not given; 600 shows the half
@@ -312,6 +312,11 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.replay.hold_s >= self.transport.timeout_s:
+            raise ValueError(
+                f"replay.hold_s {self.replay.hold_s:g} is not below transport.timeout_s "
+                f"{self.transport.timeout_s:g}: a request held would look like one unanswered"
+            )
         smallest = self.learner.batch_size
         if self.replay.min_size < smallest:
             raise ValueError(
@@ -365,9 +370,11 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
     _check_names(table, f"config {source!r}")
     if base is None:
         return table
+    if base not in preset_names():
+        base = str(path.parent / str(base))
     if base in (*above, source):
         raise ConfigError(f"config {source!r} extends itself, by {', '.join((*above, source))}")
-    below = _read_toml(str(base), (*above, source))
+    below = _read_toml(base, (*above, source))
     return below | {name: {**below.get(name, {}), **values} for name, values in table.items()}
 
 

@@ -19,11 +19,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from common.errors import CheckpointError, ConfigError
+from common.trajectory import NUM_ACTIONS
 
 Kind = Literal["duel", "ddqn", "dqn"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
-NUM_ACTIONS: Final = 3  # left, straight, right
 HIDDEN_UNITS: Final = 512
 FORMAT_VERSION: Final = 1
 _METADATA_KEY: Final = "mrcdrl"  # one JSON text: safetensors does not keep an order of several

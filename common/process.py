@@ -157,6 +157,7 @@ class StatsReporter:
         self._publisher = publisher
         self._role = role
         self._worker = worker
+        self._text = {"incarnation": str(time.time_ns())}
         self._due_s = 0.0
 
     def maybe(self, metrics: Callable[[], dict[str, float]]) -> None:
@@ -169,6 +170,6 @@ class StatsReporter:
         self._due_s = time.monotonic() + 1.0
         try:
             numbers = {name: float(value) for name, value in metrics().items()}
-            self._publisher.put(encode(Stats(self._role, self._worker, numbers)))
+            self._publisher.put(encode(Stats(self._role, self._worker, numbers, self._text)))
         except TransportError as error:
             logging.getLogger(self._role).warning("stats not published: %s", error)

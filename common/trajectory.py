@@ -20,6 +20,8 @@ Float64Array = NDArray[np.float64]
 Int64Array = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+NUM_ACTIONS = 3  # left, straight, right (paper section 3)
+
 
 class StepType(IntEnum):
     """Position of a time step in its episode (dm_env's terms)."""

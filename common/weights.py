@@ -20,28 +20,58 @@ _ASK_AGAIN_S = 0.5
 
 
 class WeightsWriter:
-    """Publishes weights, and answers late joiners with the newest from a thread of its own."""
+    """Publishes weights, and answers late joiners with the newest, from threads of its own.
+
+    A subscriber that hangs holds up the publishing thread only; what became old meanwhile is
+    left out.
+    """
 
     def __init__(self, session: Session, keys: Keys) -> None:
         self._publisher = session.publisher(keys.weights)
         self._server = session.server(keys.weights)
+        self._changed = threading.Condition()
         self._newest: bytes | None = None
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="weights")
-        self._thread.start()
+        self._published: bytes | None = None
+        self._stopping = False
+        self._threads = [
+            threading.Thread(target=self._publish, name="weights-publish"),
+            threading.Thread(target=self._serve, name="weights-serve"),
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def publish(self, weights: Weights) -> None:
-        """Raises TransportError where the session is gone."""
+        """Hand over the newest weights; returns at once."""
         payload = encode(weights)
-        self._newest = payload
-        self._publisher.put(payload)
+        with self._changed:
+            self._newest = payload
+            self._changed.notify_all()
 
     def close(self) -> None:
-        self._stopping.set()
-        self._thread.join()
+        """Publish what is still to be published, then end both threads."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
+
+    def _publish(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._newest is not self._published or self._stopping
+                )
+                payload = self._newest
+                if payload is None or payload is self._published:
+                    return
+                self._published = payload
+            try:
+                self._publisher.put(payload)
+            except TransportError as error:
+                _LOG.warning("weights not published: %s", error)
 
     def _serve(self) -> None:
-        while not self._stopping.is_set():
+        while not self._stopping:
             request = self._server.take(_TAKE_S)
             if request is None:
                 continue
@@ -58,7 +88,12 @@ class WeightsReader:
         self._subscriber = session.latest_subscriber(keys.weights)
         self._client = session.client(keys.weights, "the learner", timeout_s=2.0)
         self._order = (-1, -1)
-        self.refused = 0
+        self._refused = 0
+
+    @property
+    def refused(self) -> int:
+        """Messages that were torn, foreign or too large."""
+        return self._refused + self._subscriber.oversized
 
     def latest(self, timeout_s: float = 0.0) -> Weights | None:
         """Weights newer than the last returned; None where none came within the time."""
@@ -88,7 +123,7 @@ class WeightsReader:
         try:
             weights = decode(Weights, payload)
         except WireError as error:
-            self.refused += 1
+            self._refused += 1
             _LOG.warning("weights refused: %s", error)
             return None
         if weights.order <= self._order:

@@ -18,6 +18,7 @@ import numpy as np
 
 from common.errors import WireError
 from common.trajectory import (
+    NUM_ACTIONS,
     Chunk,
     EpisodeSummary,
     Evaluation,
@@ -53,6 +54,8 @@ def _check_chunk(chunk: Chunk) -> str | None:
         return "a reward or discount is not finite"
     if not (np.isfinite(chunk.priorities).all() and (chunk.priorities >= 0).all()):
         return "a priority is negative or not finite"
+    if chunk.actions.max() >= NUM_ACTIONS:
+        return f"an action is none of {NUM_ACTIONS}"
     if chunk.bootstrap_offsets.min() < 1:
         return "a bootstrap offset is 0"
     if chunk.sequence < 0 or chunk.weights_version < 0:

@@ -18,7 +18,7 @@ from common.arena.layout import fixed_layout, layout_for, layout_symmetries
 from common.arena.physics import World
 from common.arena.rendering import draw_arena, literal_views
 from common.arena.rewards import frame_rewards, target_distances_px
-from common.arena.scene import LEFT, NUM_ACTIONS, RIGHT, STRAIGHT, Scene, Start
+from common.arena.scene import LEFT, RIGHT, STRAIGHT, Scene, Start
 from common.arena.starts import test_starts, training_start
 from common.arena.symmetry import IDENTITY, Symmetry
 from common.arena.views import AnalyticViews
@@ -26,7 +26,6 @@ from common.arena.views import AnalyticViews
 __all__ = [
     "IDENTITY",
     "LEFT",
-    "NUM_ACTIONS",
     "RIGHT",
     "STRAIGHT",
     "AnalyticViews",

@@ -6,8 +6,7 @@ Invariants: what leaves here is uint8 [K] of LEFT, STRAIGHT, RIGHT.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from common.arena.scene import NUM_ACTIONS
-from common.trajectory import UInt8Array
+from common.trajectory import NUM_ACTIONS, UInt8Array
 
 
 def checked_actions(actions: ArrayLike, num_robots: int) -> UInt8Array:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 
 from common.arena.rewards import target_distances_px
-from common.arena.scene import NUM_ACTIONS, STRAIGHT, Scene
+from common.arena.scene import STRAIGHT, Scene
 from common.config import ArenaConfig
 from common.errors import ConfigError
-from common.trajectory import Int64Array, UInt8Array
+from common.trajectory import NUM_ACTIONS, Int64Array, UInt8Array
 
 Controller = Callable[[Scene], UInt8Array]
 

@@ -15,7 +15,6 @@ STRAIGHT = 1
 """Moves on."""
 RIGHT = 2
 """Heading increases by `turn_deg`: clockwise to the viewer. Then the robot moves on."""
-NUM_ACTIONS = 3
 
 
 @dataclass(frozen=True, slots=True)

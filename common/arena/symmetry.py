@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arena.scene import NUM_ACTIONS, Scene
-from common.trajectory import Float64Array, UInt8Array
+from common.arena.scene import Scene
+from common.trajectory import NUM_ACTIONS, Float64Array, UInt8Array
 
 
 @dataclass(frozen=True, slots=True)

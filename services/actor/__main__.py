@@ -11,6 +11,7 @@ import torch
 
 from common.arena import make_arena, make_codec
 from common.config import Config
+from common.errors import CheckpointError
 from common.exploration import epsilons
 from common.policy import Policy, make_policy
 from common.process import (
@@ -21,7 +22,7 @@ from common.process import (
     joining_arguments,
     run_main,
 )
-from common.trajectory import Float32Array
+from common.trajectory import Float32Array, Weights
 from common.transport import Session
 from common.weights import WeightsReader
 from common.wire import encode
@@ -46,6 +47,7 @@ def main(argv: Sequence[str]) -> int:
         try:
             Actor(config, joining, session, sender).run(stop)
         finally:
+            stop.set()
             sender.close()
     return 0
 
@@ -69,13 +71,12 @@ class Actor:
         self._adopted_s = time.monotonic()
         self._epsilons = self._explore()
         self._waited_s = 0.0
+        self._refused = 0  # weights of another network
         self._started_s = time.monotonic()
 
     def run(self, stop: StopSignal) -> None:
         """Follow, step, send, tell, until stopped."""
-        first = self._reader.wait(stop)
-        if first is not None:
-            self._policy.adopt(first)
+        self._adopt(self._reader.wait(stop))
         while not stop.is_set():
             self._follow()
             chunks, episodes = self._collector.step(self._epsilons)
@@ -90,12 +91,22 @@ class Actor:
 
     def _follow(self) -> None:
         """Adopt newer weights, and explore as their step and the number of actors say."""
-        weights = self._reader.latest()
-        if weights is not None:
-            self._policy.adopt(weights)
-            self._adopted_s = time.monotonic()
-        if weights is not None or any(True for _ in self._peers.changes()):
+        adopted = self._adopt(self._reader.latest())
+        if adopted or any(True for _ in self._peers.changes()):
             self._epsilons = self._explore()
+
+    def _adopt(self, weights: Weights | None) -> bool:
+        """Act by these weights from now on, unless there are none or they are foreign."""
+        if weights is None:
+            return False
+        try:
+            self._policy.adopt(weights)
+        except CheckpointError as error:
+            self._refused += 1
+            _LOG.warning("weights %d refused: %s", weights.version, error)
+            return False
+        self._adopted_s = time.monotonic()
+        return True
 
     def _explore(self) -> Float32Array:
         """Epsilon of each arena; an actor's rank is its place among the names of those alive."""
@@ -121,7 +132,7 @@ class Actor:
             "spool_chunks": self._sender.spooled,
             "weights_version": self._policy.weights_version,
             "weights_age_s": now - self._adopted_s,
-            "weights_refused": self._reader.refused,
+            "weights_refused": self._reader.refused + self._refused,
             "epsilon_min": float(self._epsilons.min()),
             "epsilon_max": float(self._epsilons.max()),
             "inference_share": seconds.inference / lived_s,

@@ -31,7 +31,6 @@ class Seconds:
 class _Episode:
     """What is counted of an episode under way."""
 
-    number: int
     rewards: float = 0.0
     greedy_q: float = 0.0
     frames: int = 0
@@ -61,7 +60,7 @@ class Collector:
         self._chunkers = [[Chunker(origin) for _ in range(self._num_robots)] for _ in arenas]
         self._frames = FrameStack(num_states, config.arena.stack, config.arena.view_px)
         self._sequence: Iterator[int] = iter(range(2**62))
-        self._episodes = [_Episode(0) for _ in arenas]
+        self._episodes = [_Episode() for _ in arenas]
         self.seconds = Seconds()
         self.env_steps = 0
         self.num_episodes = 0
@@ -135,7 +134,7 @@ class Collector:
         episode = self._episodes[index]
         if time_step.outcome is None:
             raise ValueError("an arena ended an episode without an outcome")
-        self._episodes[index] = _Episode(self.num_episodes + 1)
+        self._episodes[index] = _Episode()
         self.num_episodes += 1
         return EpisodeSummary(
             actor=self._origin.actor,

@@ -7,7 +7,6 @@ replay's rate limiter holds the arenas back.
 import queue
 import threading
 
-from common.errors import MrcdrlError
 from common.trajectory import Chunk
 from services.replay.client import ReplayWriter
 
@@ -21,7 +20,7 @@ class Sender:
         self._writer = writer
         self._spool: queue.Queue[Chunk] = queue.Queue(spool_chunks)
         self._closing = threading.Event()
-        self._error: MrcdrlError | None = None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="sender")
         self.chunks = 0
         self.transitions = 0
@@ -60,7 +59,7 @@ class Sender:
                 continue
             try:
                 reply = self._writer.insert(chunk)
-            except MrcdrlError as error:
+            except Exception as error:  # noqa: BLE001  raised again by put, in the owner's thread
                 self._error = error
                 return
             if reply is None:

@@ -64,6 +64,7 @@ class RunState:
 
     def __init__(self, config: Config) -> None:
         self.config = config
+        self.resumed_at_s = 0.0  # seconds the run had lasted when it was taken up again
         self.log: deque[str] = deque(maxlen=LOG_LINES)
         self.evaluations: list[EvaluationRecord] = []
         self.episodes = 0
@@ -153,8 +154,10 @@ class RunState:
         return [s.metrics[name] for s in self.alive(role) if name in s.metrics]
 
     def _known(self, role: str, name: str) -> float:
-        """Sum of a metric over a role's services, there or not."""
-        return sum(s.metrics.get(name, 0) for s in self._services.values() if s.role == role)
+        """Sum of a metric over a role's services that are there, else the last one heard of."""
+        heard = [s for s in self._services.values() if s.role == role and name in s.metrics]
+        there = [s for s in heard if s.alive] or sorted(heard, key=lambda s: s.heard_s or 0.0)[-1:]
+        return sum(s.metrics[name] for s in there)
 
     # -- counters and rates ---------------------------------------------------------------
 
@@ -260,7 +263,7 @@ class RunState:
         """Until `run.minutes` or, at the present rate, `run.learner_steps`; None: no end known."""
         run, ends = self.config.run, []
         if run.minutes:
-            ends.append(max(0.0, 60 * run.minutes - now))
+            ends.append(max(0.0, 60 * run.minutes - (now - self.resumed_at_s)))
         rate = self.per_second("learner_steps", now)
         if run.learner_steps and rate > 0:
             ends.append(max(0.0, (run.learner_steps - self.learner_steps) / rate))

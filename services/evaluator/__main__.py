@@ -17,6 +17,7 @@ from common.errors import CheckpointError
 from common.files import read_weights, write_weights
 from common.policy import make_policy
 from common.process import (
+    Joining,
     StatsReporter,
     StopSignal,
     fetch_config,
@@ -39,47 +40,80 @@ BEST = Path("checkpoints") / "best.safetensors"
 def main(argv: Sequence[str]) -> int:
     """Judge for a run; the exit code."""
     joining = joining_arguments("evaluator", argv)
-    keys, worker = joining.keys, joining.worker
     stop = StopSignal().listen()
     os.nice(_NICE)
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)
         torch.set_num_threads(config.evaluator.threads)
-        reporter = StatsReporter(
+        evaluator = Evaluator(config, joining, session, stop)
+        session.announce(joining.keys.live("evaluator", joining.worker))
+        evaluator.run()
+    return 0
+
+
+class Evaluator:
+    """The shell around a judge."""
+
+    def __init__(
+        self, config: Config, joining: Joining, session: Session, stop: StopSignal
+    ) -> None:
+        keys, worker = joining.keys, joining.worker
+        self._settings = config.evaluator
+        self._stop = stop
+        self._reader = WeightsReader(session, keys)
+        self._judge = Judge(config, worker)
+        self._best = Best(joining.run_dir / BEST)
+        self._publisher = session.publisher(keys.evaluation(worker))
+        self._reporter = StatsReporter(
             session.publisher(keys.stats("evaluator", worker)), "evaluator", worker
         )
-        publisher = session.publisher(keys.evaluation(worker))
-        reader = WeightsReader(session, keys)
-        judge = Judge(config, worker)
-        best = Best(joining.run_dir / BEST)
-        session.announce(keys.live("evaluator", worker))
-        weights = reader.wait(stop)
-        count, busy = 0, False
+        self._evaluations = 0
+        self._version = -1
+        self._busy = False
 
-        def metrics() -> dict[str, float]:
-            version = -1 if weights is None else weights.version
-            return {"evaluations": count, "weights_version": version, "busy": busy}
+    def run(self) -> None:
+        """Judge, rest, take the newest weights, until stopped."""
+        weights = self._reader.wait(self._stop)
+        while weights is not None:
+            began_s = time.monotonic()
+            self._evaluate(weights)
+            spent_s = time.monotonic() - began_s
+            rest_s = max(self._settings.period_s, spent_s / self._settings.max_share)
+            weights = self._newest_after(began_s + rest_s)
 
-        def go_on() -> bool:
-            reporter.maybe(metrics)
-            return not stop.is_set()
+    def _evaluate(self, weights: Weights) -> None:
+        """Judge one version, publish the result, keep the weights if they are the best."""
+        self._version, self._busy = weights.version, True
+        try:
+            result = self._judge.judge(weights, self._go_on)
+        except CheckpointError as error:
+            _LOG.warning("weights %d refused: %s", weights.version, error)
+            result = None
+        self._busy = False
+        if result is not None:
+            self._evaluations += 1
+            self._publisher.put(encode(result))
+            self._best.offer(weights, result)
 
-        while weights is not None and not stop.is_set():
-            began_s, busy = time.monotonic(), True
-            result = judge.judge(weights, go_on)
-            busy = False
-            if result is None:
-                break
-            count += 1
-            publisher.put(encode(result))
-            best.offer(weights, result)
-            newer = None
-            share = config.evaluator.max_share
-            rest_until_s = began_s + max(config.evaluator.period_s, result.wall_s / share)
-            while go_on() and (newer is None or time.monotonic() < rest_until_s):
-                newer = reader.latest(_POLL_S) or newer
-            weights = newer
-    return 0
+    def _newest_after(self, until_s: float) -> Weights | None:
+        """The newest weights once the time has come and there are newer ones; None at the end."""
+        newest: Weights | None = None
+        while newest is None or time.monotonic() < until_s:
+            if not self._go_on():
+                return None
+            newest = self._reader.latest(_POLL_S) or newest
+        return newest
+
+    def _go_on(self) -> bool:
+        self._reporter.maybe(self._metrics)
+        return not self._stop.is_set()
+
+    def _metrics(self) -> dict[str, float]:
+        return {
+            "evaluations": self._evaluations,
+            "weights_version": self._version,
+            "busy": self._busy,
+        }
 
 
 class Judge:
@@ -122,19 +156,20 @@ class Best:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        try:
-            _, manifest = read_weights(path)
-        except CheckpointError:
-            manifest = {}
-        rate, frames = manifest.get("success_rate", -1), manifest.get("mean_frames", np.inf)
-        self._rank = (float(rate), -float(frames))
 
     def offer(self, weights: Weights, result: Evaluation) -> None:
         """Keep the weights if they did better: more successes, or as many in less time."""
-        rank = (result.success_rate, -result.mean_frames)
-        if rank > self._rank:
+        if (result.success_rate, -result.mean_frames) > self._rank():
             write_weights(self._path, weights.payload, dataclasses.asdict(result))
-            self._rank = rank
+
+    def _rank(self) -> tuple[float, float]:
+        """Of the file, which another evaluator may have written since."""
+        try:
+            _, manifest = read_weights(self._path)
+        except CheckpointError:
+            manifest = {}
+        rate, frames = manifest.get("success_rate", -1), manifest.get("mean_frames", np.inf)
+        return (float(rate), -float(frames))
 
 
 if __name__ == "__main__":

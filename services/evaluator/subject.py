@@ -1,8 +1,10 @@
 """What is to be judged, from a command line: weights or a controller, in which arena."""
 
 import argparse
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +20,7 @@ from common.trajectory import Weights
 from services.evaluator.trial import ControllerPlayer, Player, PolicyPlayer
 
 _RUN_CONFIG = "config.toml"
+_MANIFEST = "manifest.json"
 _BEST = Path("checkpoints") / "best.safetensors"
 
 
@@ -67,7 +70,7 @@ def subject(arguments: argparse.Namespace) -> Subject:
         return Subject(config, None, arguments.controller, Weights(0, 0, 0, b""))
     path = weights_path(arguments.weights)
     config = load_config(arguments.config or _config_beside(path), given)
-    payload, manifest = read_weights(path)
+    payload, manifest = _read(path)
     torch.set_num_threads(config.evaluator.threads)
     network = network_from_bytes(payload, compute_dtype=precision(config.learner.precision))
     if (network.stack, network.view_px) != (config.arena.stack, config.arena.view_px):
@@ -96,6 +99,14 @@ def weights_path(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     raise CheckpointError(f"{path} holds no weights")
+
+
+def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """Weights and what is known of them, kept alone or as part of a checkpoint."""
+    payload, manifest = read_weights(path)
+    if not manifest and (path.parent / _MANIFEST).is_file():
+        manifest = json.loads((path.parent / _MANIFEST).read_bytes())
+    return payload, manifest
 
 
 def _config_beside(path: Path) -> str:

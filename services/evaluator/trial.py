@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from common.arena import Arena, ObservationCodec, Scene, Start
 from common.config import ArenaConfig
 from common.policy import FrameStack, Policy
-from common.trajectory import Float64Array, Outcome, TimeStep, UInt8Array
+from common.trajectory import NUM_ACTIONS, Float64Array, Outcome, TimeStep, UInt8Array
 
 _MAX_ARENAS = 64
 PER = 100  # episodes a block of Table 2
@@ -103,7 +103,7 @@ class ControllerPlayer:
     def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
         actions = np.stack([self._controller(scene) for scene in scenes])
         explores = self._rng.random(actions.shape) < self._epsilon
-        uniform = self._rng.integers(3, size=actions.shape, dtype=np.uint8)
+        uniform = self._rng.integers(NUM_ACTIONS, size=actions.shape, dtype=np.uint8)
         return np.where(explores, uniform, actions)
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:

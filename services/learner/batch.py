@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from common.errors import WireError
-from common.network import NUM_ACTIONS
-from common.trajectory import Float32Array, Samples, UInt8Array
+from common.trajectory import NUM_ACTIONS, Float32Array, Samples, UInt8Array
 
 
 class Symmetry(Protocol):

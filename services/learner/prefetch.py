@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from common.errors import MrcdrlError, WireError
+from common.errors import WireError
 from common.process import StopSignal
 from common.trajectory import Samples
 from services.learner.batch import Batch
@@ -44,11 +44,6 @@ class Prefetcher:
         """Batches that wait."""
         return self._ready.qsize()
 
-    @property
-    def held_for(self) -> str:
-        """Why replay holds the requests; empty where it does not."""
-        return self._reader.held_for
-
     def next(self, timeout_s: float) -> Batch | None:
         """The next batch; None where none is ready within the time.
 
@@ -77,7 +72,7 @@ class Prefetcher:
                 self.refused += 1
                 _LOG.warning("a mini-batch refused: %s", error)
                 continue
-            except MrcdrlError as error:
+            except Exception as error:  # noqa: BLE001  raised again by next, in the owner's thread
                 self._error = error
                 return
             self.decode_s += time.perf_counter() - started

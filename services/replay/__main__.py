@@ -84,6 +84,7 @@ def build(config: Config) -> tuple[Table, RateLimiter]:
         capacity=config.replay.capacity,
         stack=config.arena.stack,
         n_step=config.agent.n_step,
+        chunk_length=config.actor.chunk_length,
         record_bytes=config.arena.record_bytes,
         rng=np.random.default_rng(config.replay.seed),
     )

@@ -4,7 +4,7 @@ import logging
 import time
 from collections import deque
 
-from common.errors import DeadlineError, HeldError
+from common.errors import DeadlineError, HeldError, WireError
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Chunk, InsertReply, Samples
@@ -38,7 +38,7 @@ class ReplayWriter:
                 return decode(InsertReply, self._client.ask(payload).result())
             except HeldError:
                 self._patience.renew()
-            except DeadlineError:
+            except (DeadlineError, WireError):
                 self._patience.spend()
                 self._stop.wait(_RETRY_S)
             if self._stop.is_set():
@@ -63,7 +63,6 @@ class ReplayReader:
         self._pending: deque[PendingReply] = deque()
         self._patience = _Patience("replay has not answered with a mini-batch", warn_s)
         self._stop = stop
-        self.held_for = ""  # replay's reason while it holds the requests
 
     def sample(self) -> Samples | None:
         """The next mini-batch; None when stopped before it came."""
@@ -73,14 +72,12 @@ class ReplayReader:
                 self._pending.append(self._client.ask(self._payload))
             try:
                 samples = decode(Samples, self._pending.popleft().result())
-            except HeldError as held:
-                self.held_for = str(held)
+            except HeldError:
                 self._patience.renew()
             except DeadlineError:
                 self._patience.spend()
                 self._stop.wait(_RETRY_S)
             else:
-                self.held_for = ""
                 return samples
         return None
 

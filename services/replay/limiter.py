@@ -67,10 +67,13 @@ class RateLimiter:
             return False
         return not self.samples_per_insert or self._lead - count >= -self.error_buffer
 
-    def resume(self, inserts: int) -> None:
-        """Go on after `inserts` of earlier processes, neither side ahead."""
-        self.inserts = inserts
-        self.samples = round(max(inserts - self.min_size, 0) * self.samples_per_insert)
+    def resume(self, size: int) -> None:
+        """Go on with a table that holds `size` transitions of earlier processes.
+
+        They count as just inserted and neither side as ahead.
+        """
+        self.inserts = size
+        self.samples = round(max(size - self.min_size, 0) * self.samples_per_insert)
 
     @property
     def ratio(self) -> float:

@@ -57,6 +57,7 @@ class ReplayService:
         self._limiter = limiter
         self._log = log
         self._book = SequenceBook()
+        self._earlier = 0  # transitions of earlier processes that were evicted
         self._changed = threading.Condition()
         self._stopping = threading.Event()
         self._counts = dict.fromkeys(("chunks", "duplicates", "gaps", "refused", "log_errors"), 0)
@@ -71,17 +72,20 @@ class ReplayService:
         if self._log is None:
             return
         self._table.number_from(self._log.first_key)
+        left_out = ""
         for payload in self._log.recover(lambda: self._table.next_key):
             try:
                 chunk = decode(Chunk, payload)
-                self._table.insert(chunk)
+                self._store(chunk, self._classify(chunk))
             except WireError as error:
                 self._counts["refused"] += 1
-                _LOG.warning("a chunk of the log is left out: %s", error)
-            else:
-                self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
-        self._log.forget(self._table.first_key)
-        self._limiter.resume(self._table.next_key)
+                left_out = str(error)
+        if left_out:
+            count = self._counts["refused"]
+            _LOG.warning("%d chunks of the log are left out, the last: %s", count, left_out)
+        self._forget()
+        self._limiter.resume(len(self._table))
+        self._earlier = self._table.next_key - len(self._table)
 
     def start(self) -> None:
         for thread in self._threads:
@@ -106,8 +110,9 @@ class ReplayService:
                 "size": len(self._table),
                 "capacity": self._table.capacity,
                 "min_size": self._limiter.min_size,
-                "inserts": self._limiter.inserts,
-                "samples": self._limiter.samples,
+                "inserts": self._earlier + self._limiter.inserts,
+                "samples": self._limiter.samples
+                + round(self._earlier * self._limiter.samples_per_insert),
                 "samples_per_insert": self._limiter.ratio,
                 "bytes": self._table.nbytes,
                 **self._counts,
@@ -135,23 +140,33 @@ class ReplayService:
                 f"{self._limiter.largest_insert}: the rate limiter might never let them in"
             )
         with self._changed:
-            arrival = self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
-            if arrival is Arrival.REPEATED:
-                self._counts["duplicates"] += 1
-            elif self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
+            arrival = self._classify(chunk)
+            if arrival is not Arrival.REPEATED:
+                if not self._wait(
+                    "insert_held", request, lambda: self._limiter.can_insert(len(chunk))
+                ):
+                    request.hold("the learner has not sampled enough of what is there yet")
+                    return
                 if not self._logged(request, len(chunk)):
                     return
-                self._table.insert(chunk)
-                self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
-                self._limiter.inserts += len(chunk)
-                self._counts["chunks"] += 1
-                self._counts["gaps"] += arrival is Arrival.GAP
-                self._changed.notify_all()
-            else:
-                request.hold("the learner has not sampled enough of what is there yet")
-                return
-            total = self._limiter.inserts
+            self._store(chunk, arrival)
+            self._changed.notify_all()
+            total = self._table.next_key
         request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
+
+    def _classify(self, chunk: Chunk) -> Arrival:
+        return self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
+
+    def _store(self, chunk: Chunk, arrival: Arrival) -> None:
+        """Put a chunk into the table, unless it was here before; count it."""
+        if arrival is Arrival.REPEATED:
+            self._counts["duplicates"] += 1
+            return
+        self._table.insert(chunk)
+        self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
+        self._limiter.inserts += len(chunk)
+        self._counts["chunks"] += 1
+        self._counts["gaps"] += arrival is Arrival.GAP
 
     def _logged(self, request: _Request, num_transitions: int) -> bool:
         """Whether the request's chunk is in the log; else the request is held."""
@@ -159,14 +174,23 @@ class ReplayService:
             return True
         try:
             self._log.append(request.payload, self._table.next_key, num_transitions)
-            self._log.forget(self._table.first_key)
         except OSError as error:
             self._counts["log_errors"] += 1
             if self._counts["log_errors"] == 1:
                 _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
             request.hold(f"replay's log cannot be written: {reason(error)}")
             return False
+        self._forget()
         return True
+
+    def _forget(self) -> None:
+        """Drop what the table has evicted; a file that stays is only in the way."""
+        if self._log is None:
+            return
+        try:
+            self._log.forget(self._table.first_key)
+        except OSError as error:
+            _LOG.warning("an old file of the log stays: %s", reason(error))
 
     def _sample(self, request: _Request) -> None:
         size = decode(SampleRequest, request.payload).batch_size

@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from common.errors import ConfigError, WireError
 from common.trajectory import Chunk, Samples, UInt8Array
 
-_ROW_SLACK = 1.25  # rows a transition: history, bootstrap tail and short last chunks
+_CHUNK_ENDS = 2.0  # history and tail a full chunk's length of transitions: last chunks are short
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,15 +31,22 @@ class Table:
     """First in, first out, sampled uniformly with replacement.
 
     capacity: transitions. stack: records of a state. n_step: longest return; a transition
-    touches a window of stack + n_step records. record_bytes: length of one record. rng: draws
-    the samples.
+    touches a window of stack + n_step records. chunk_length: transitions of most chunks; many
+    shorter ones leave less than the capacity. record_bytes: length of one record. rng: draws the
+    samples.
     """
 
     def __init__(
-        self, capacity: int, stack: int, n_step: int, record_bytes: int, rng: np.random.Generator
+        self,
+        capacity: int,
+        stack: int,
+        n_step: int,
+        chunk_length: int,
+        record_bytes: int,
+        rng: np.random.Generator,
     ) -> None:
         window = stack + n_step
-        num_rows = int(capacity * _ROW_SLACK) + 2 * window
+        num_rows = int(capacity * (1 + _CHUNK_ENDS * (window - 1) / chunk_length)) + 2 * window
         try:
             self._rows: UInt8Array = np.zeros((num_rows, record_bytes), np.uint8)
         except MemoryError as error:

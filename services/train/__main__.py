@@ -104,7 +104,7 @@ def supervise(
     config, keys = run.config, Keys(run.path.name)
     state, rule = RunState(config), StoppingRule(config.run)
     fleet.start("replay", "replay-0", replay_arguments(run, endpoint))
-    with join(fleet, endpoint) as session:
+    with join(fleet, transport(config, endpoint)) as session:
         run.note_endpoint(endpoint)
         follower = Follower(session, keys, state, recorder, rule)
         for role, count in {
@@ -132,12 +132,17 @@ def supervise(
     return reason
 
 
-def join(fleet: Fleet, endpoint: str) -> Session:
+def transport(config: Config, endpoint: str) -> TransportConfig:
+    """The configured transport, connecting to the replay service of this machine."""
+    return config.transport.model_copy(update={"listen": (), "connect": (endpoint,)})
+
+
+def join(fleet: Fleet, transport: TransportConfig) -> Session:
     """A session with the replay service, or the reason that one ended for."""
     deadline = time.monotonic() + _JOIN_S
     while True:
         try:
-            return Session(TransportConfig(connect=(endpoint,)), open_timeout_s=0.0)
+            return Session(transport, open_timeout_s=0.0)
         except EndpointError:
             fleet.watch()
             if time.monotonic() > deadline:
@@ -154,7 +159,10 @@ def replay_arguments(run: RunDirectory, endpoint: str) -> list[str]:
 def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
     run_dir = str(run.path.parent)
     name = run.path.name
-    return ["--run", name, "--connect", endpoint, "--run-dir", run_dir, "--id", worker]
+    arguments = ["--run", name, "--connect", endpoint, "--run-dir", run_dir, "--id", worker]
+    for field, value in run.config.transport.model_dump(exclude={"listen", "connect"}).items():
+        arguments += [f"--transport.{field}", str(value).lower()]
+    return arguments
 
 
 def expectation(config: Config) -> str:

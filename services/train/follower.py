@@ -31,7 +31,7 @@ class Follower:
         self._state = state
         self._recorder = recorder
         self._rule = rule
-        self._lasted_s = recorder.restore(state, rule)
+        self._lasted_s = state.resumed_at_s = recorder.restore(state, rule)
         self._started_s = time.monotonic()
         self._record_due_s = 0.0
 

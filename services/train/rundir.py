@@ -1,7 +1,7 @@
 """A run's folder: made new, or taken up again, by one process at a time.
 
-    runs/NAME/  config.toml  endpoint (while it runs)  lock  logs/  checkpoints/  tensorboard/
-                metrics.jsonl  episodes.jsonl  evaluations.jsonl
+    runs/NAME/  config.toml  endpoint (while it runs)  logs/  replay/  checkpoints/
+                tensorboard/  metrics.jsonl  episodes.jsonl  evaluations.jsonl
                 summary.json  training.png  trajectories.png  evaluation.mp4
 
 Invariants: a folder that exists is never taken for a new run; two processes never hold one.
@@ -21,7 +21,6 @@ from common.files import atomic_write, reason
 from common.process import ENDPOINT_FILE
 
 CONFIG_FILE = "config.toml"
-_LOCK = "lock"
 
 
 def default_name(config_name: str, num_robots: int) -> str:
@@ -41,7 +40,7 @@ class RunDirectory:
         self.path = path
         self.config = config
         self.resumed = resumed
-        self._lock = os.open(path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        self._lock = os.open(path, os.O_RDONLY)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -105,5 +104,4 @@ class RunDirectory:
     def close(self) -> None:
         """Release the folder."""
         (self.path / ENDPOINT_FILE).unlink(missing_ok=True)
-        (self.path / _LOCK).unlink(missing_ok=True)
         os.close(self._lock)

@@ -50,7 +50,7 @@ def chunks(draw: st.DrawFn) -> Chunk:
         sequence=draw(COUNTS),
         weights_version=draw(COUNTS),
         records=draw(arrays("u1", length + tail, record_bytes)),
-        actions=draw(arrays("u1", length)),
+        actions=draw(npst.arrays("u1", (length,), elements=st.integers(0, 2))),
         rewards=draw(arrays("f4", length, **FINITE)),
         discounts=draw(arrays("f4", length, **FINITE)),
         bootstrap_offsets=draw(npst.arrays("u1", (length,), elements=st.integers(1, 255))),

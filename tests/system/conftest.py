@@ -20,7 +20,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     name, before = run_name("smoke"), shared_memory_files()
     arguments = ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
     with Command([*arguments, "--learner-steps", "60"], folder) as train:
-        code = train.wait(300)
+        code = train.wait(600)
     left = processes_of(name)
     end_all(name)
     return Finished(

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-BY_HAND_S = 90.0  # a loaded machine takes so long for what takes five seconds on an idle one
+PATIENCE_S = 300.0  # a machine under load takes so long for what takes five seconds on an idle one
 T = TypeVar("T")
 
 # Every part at its smallest: pictures of 32 px, short episodes.
@@ -85,7 +85,7 @@ class Command:
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
 
-    def wait(self, timeout_s: float = BY_HAND_S) -> int:
+    def wait(self, timeout_s: float = PATIENCE_S) -> int:
         """The exit code."""
         return self.process.wait(timeout_s)
 
@@ -113,7 +113,7 @@ class Finished:
     shared_memory_left: set[str]
 
 
-def eventually(look: Callable[[], T | None], what: str, timeout_s: float = BY_HAND_S) -> T:
+def eventually(look: Callable[[], T | None], what: str, timeout_s: float = PATIENCE_S) -> T:
     """What `look` returns as soon as that is true; fails after the time."""
     pause = threading.Event()
     deadline = time.monotonic() + timeout_s

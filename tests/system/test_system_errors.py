@@ -25,7 +25,7 @@ from tests.system.system_processes import (
     run_name,
 )
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
 
 def refused(folder: Path, arguments: Sequence[str | Path], **variables: str) -> str:
@@ -45,7 +45,7 @@ def runs(tmp_path: Path) -> Path:
     return folder
 
 
-# -- settings -----------------------------------------------------------------------------------
+# -- settings ------------------------------------------------------------------------------------
 
 SETTINGS = {
     "unknown command": (["trian"], ["trian", "train"]),
@@ -99,7 +99,7 @@ def test_unknown_names_in_file_and_environment_show_the_nearest(tmp_path: Path, 
     assert list(runs.iterdir()) == []
 
 
-# -- weights --------------------------------------------------------------------------------------
+# -- weights -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_subjects_of_an_evaluation_that_make_no_sense(case: str, tmp_path: Path)
     assert words in refused(tmp_path, ["evaluate", *given])
 
 
-# -- folders and ports ------------------------------------------------------------------------------
+# -- folders and ports ---------------------------------------------------------------------------
 
 
 def test_a_run_that_exists_is_not_touched(tmp_path: Path, runs: Path) -> None:
@@ -211,7 +211,7 @@ def test_a_service_that_cannot_start_says_why_at_once(tmp_path: Path, runs: Path
         end_all(name)
 
 
-# -- a full disk --------------------------------------------------------------------------------------
+# -- a full disk ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -235,8 +235,8 @@ def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: P
     more = ["--learner-steps", "100000000", "--replay.fsync", "off"]
     try:
         with Command([*arguments, *more], tmp_path) as train:
-            eventually(lambda: checkpoint.latest(run / "checkpoints"), "a checkpoint", 120)
-            assert train.wait(200) > 0
+            eventually(lambda: checkpoint.latest(run / "checkpoints"), "a checkpoint")
+            assert train.wait() > 0
         assert "No space left on device" in error_line(train.err)
         assert processes_of(name) == {}
     finally:
@@ -251,7 +251,7 @@ def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: P
 
 def test_a_disk_too_full_for_a_run_gets_none(tmp_path: Path, small_disk: Path) -> None:
     with (small_disk / "ballast").open("wb") as ballast:
-        ballast.write(bytes(9 << 20 - 0))
+        ballast.write(bytes(9 << 20))
     line = refused(tmp_path, ["train", "--run-dir", small_disk, "--name", "none"])
     assert "No space left on device" in line
     assert not (small_disk / "none").exists()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from common.config import Config, ReplayConfig
+from common.config import Config, ReplayConfig, TransportConfig
 from common.trajectory import Chunk, InsertReply, Samples, Stats
 from common.wire import SampleRequest, decode, encode
 from services.replay.limiter import RateLimiter
@@ -102,8 +102,11 @@ class Replay:
 def replay(
     *, min_size: int = 10, ratio: float = 0.0, buffer: float = 0.0, hold_s: float = _DEADLINE_S
 ) -> Iterator[Replay]:
-    config = Config(replay=ReplayConfig(capacity=1000, min_size=100, hold_s=hold_s))
-    table = Table(1000, 2, 1, 4, np.random.default_rng(0))
+    config = Config(
+        replay=ReplayConfig(capacity=1000, min_size=100, hold_s=hold_s),
+        transport=TransportConfig(timeout_s=2 * hold_s),
+    )
+    table = Table(1000, 2, 1, LENGTH, 4, np.random.default_rng(0))
     limiter = RateLimiter(ratio, min_size, buffer, LENGTH, BATCH)
     inserts, samples = FakeServer(), FakeServer()
     service = ReplayService(config, table, limiter, inserts, samples)

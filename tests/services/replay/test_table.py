@@ -41,8 +41,11 @@ def make_chunk(number: int, length: int, *, stack: int = 4, n_step: int = 1) -> 
     )
 
 
+CHUNK_LENGTH = 8
+
+
 def make_table(capacity: int, *, stack: int = 4, n_step: int = 1, seed: int = 0) -> Table:
-    return Table(capacity, stack, n_step, RECORD_BYTES, np.random.default_rng(seed))
+    return Table(capacity, stack, n_step, CHUNK_LENGTH, RECORD_BYTES, np.random.default_rng(seed))
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,7 @@ def test_a_chunk_of_other_settings_is_refused(chunk: Callable[[], Chunk], reason
 
 
 def test_memory_is_the_rows_and_the_columns() -> None:
-    table = Table(1000, 4, 1, 80, np.random.default_rng(0))
+    table = Table(1000, 4, 1, 50, 80, np.random.default_rng(0))
     per_transition = 8 + 1 + 4 + 4 + 1 + 8
-    assert table.nbytes == (1250 + 2 * 5) * 80 + 1000 * per_transition
+    assert table.nbytes == (1160 + 2 * 5) * 80 + 1000 * per_transition
     assert table.capacity == 1000
