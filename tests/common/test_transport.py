@@ -13,7 +13,7 @@ from common.errors import DeadlineError, EndpointError, HeldError, RefusedError
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Weights
-from common.transport import Server, Session, free_endpoint
+from common.transport import Publisher, Server, Session, free_endpoint
 from common.weights import WeightsReader, WeightsWriter
 
 _DEADLINE_S = 20.0
@@ -186,15 +186,31 @@ def test_a_full_server_holds_further_requests(network: Network) -> None:
     assert first.result() == b"done"
 
 
+def payload_of(item: tuple[str, bytes] | None) -> bytes | None:
+    return None if item is None else item[1]
+
+
+def until_known(publisher: Publisher, take: Callable[[float], bytes | None]) -> None:
+    """Publish until the subscription is known over there: what is put before is lost."""
+    while take(0.1) is None:
+        publisher.put(b"early")
+    publisher.put(b"known")
+    while take(_DEADLINE_S) != b"known":
+        pass
+
+
 def test_the_latest_subscriber_keeps_the_newest_only(network: Network) -> None:
     session, other = network.join(), network.join()
     subscriber = session.latest_subscriber(KEY)
     marks = session.queue_subscriber("mrcdrl/test/mark")
     publisher, marker = other.publisher(KEY), other.publisher("mrcdrl/test/mark")
+    until_known(publisher, subscriber.take)
+    until_known(marker, lambda timeout_s: payload_of(marks.take(timeout_s)))
     for number in range(100):
         publisher.put(str(number).encode())
-    marker.put(b"")
-    assert marks.take(_DEADLINE_S) is not None  # so all before it have come
+    marker.put(b"end")
+    while marks.take(_DEADLINE_S) != ("mrcdrl/test/mark", b"end"):  # then all before it have come
+        pass
     assert subscriber.take() == b"99"
     assert subscriber.take() is None
     assert subscriber.take(0.01) is None
@@ -204,6 +220,7 @@ def test_the_queue_keeps_the_order_and_counts_what_it_drops(network: Network) ->
     subscriber = network.join().queue_subscriber("mrcdrl/test/queue/*", capacity=10)
     session = network.join()
     publisher = session.publisher("mrcdrl/test/queue/a")
+    until_known(publisher, lambda timeout_s: payload_of(subscriber.take(timeout_s)))
     for number in range(25):
         publisher.put(bytes([number]))
     eventually(lambda: subscriber.dropped == 15)
@@ -218,10 +235,15 @@ def test_a_publication_that_is_too_large_is_counted_and_dropped(small_network: N
     latest = small_network.join().latest_subscriber(KEY)
     waiting = small_network.join().queue_subscriber(KEY)
     publisher = small_network.join().publisher(KEY)
+    until_known(publisher, latest.take)
+    until_known(publisher, lambda timeout_s: payload_of(waiting.take(timeout_s)))
+    publisher.put(b"ready")
+    while waiting.take(_DEADLINE_S) != (KEY, b"ready"):
+        pass
     publisher.put(b"x" * 1001)
     publisher.put(b"x" * 1000)
     assert waiting.take(_DEADLINE_S) == (KEY, b"x" * 1000)
-    assert latest.take(_DEADLINE_S) == b"x" * 1000
+    eventually(lambda: latest.take(0.1) == b"x" * 1000)
     assert (waiting.dropped, latest.oversized) == (1, 1)
 
 
