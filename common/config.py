@@ -135,12 +135,28 @@ class AgentConfig(Section):
     """(ours; ancestor: rmsprop)"""
     learning_rate: Positive = 1e-4
     """(ours)"""
+    learning_rate_schedule: tuple[tuple[int, float], ...] = ((0, 1.0),)
+    """Points (learner step, factor of learning_rate), linear between, constant after the last.
+    (ours)"""
     optimizer_epsilon: Positive = 1e-7
     """Added to the root of the second moment; 1.5e-4 all but stops learning here. (ours)"""
     max_gradient_norm: Annotated[float, Field(ge=0)] = 10.0
     """Clipped above; 0: never. (ours; dueling paper: 10)"""
     target_period: Count = 2500
     """Learner steps between copies to the target network: t of section 4. (ours; Ape-X: 2500)"""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_schedule("learning_rate_schedule", self.learning_rate_schedule)
+        if any(factor <= 0 for _, factor in self.learning_rate_schedule):
+            raise ValueError("learning_rate_schedule has a factor that is not above 0")
+        return self
+
+
+def _check_schedule(name: str, points: Sequence[tuple[int, float]]) -> None:
+    steps = [step for step, _ in points]
+    if not steps or steps[0] != 0 or steps != sorted(set(steps)):
+        raise ValueError(f"{name} needs points whose steps rise from 0")
 
 
 class ExplorationConfig(Section):
@@ -156,9 +172,7 @@ class ExplorationConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        steps = [step for step, _ in self.schedule]
-        if not steps or steps[0] != 0 or steps != sorted(set(steps)):
-            raise ValueError("schedule needs points whose steps rise from 0")
+        _check_schedule("schedule", self.schedule)
         if any(not 0 <= epsilon <= 1 for _, epsilon in self.schedule):
             raise ValueError("schedule has an epsilon outside 0 ... 1")
         return self

@@ -4,20 +4,12 @@ Invariants: pure; epsilon stays in 0 ... 1; with the ladder, all arenas of all a
 hold exponents spread evenly over 1 ... ladder_power, and so does each actor by itself.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from common.config import ExplorationConfig
 from common.errors import ConfigError
+from common.schedule import value_at
 from common.trajectory import Float32Array, Float64Array
-
-
-def epsilon_at(schedule: Sequence[tuple[int, float]], learner_step: int) -> float:
-    """Epsilon at a learner step: linear between the points, constant before and after them."""
-    steps = [step for step, _ in schedule]
-    values = [epsilon for _, epsilon in schedule]
-    return float(np.interp(learner_step, steps, values))
 
 
 def ladder_exponents(num_actors: int, rank: int, num_arenas: int, power: float) -> Float64Array:
@@ -39,7 +31,7 @@ def epsilons(
     config: ExplorationConfig, learner_step: int, rank: int, num_actors: int, num_arenas: int
 ) -> Float32Array:
     """Epsilon of each arena of actor `rank`, float32 [num_arenas]."""
-    epsilon = epsilon_at(config.schedule, learner_step)
+    epsilon = value_at(config.schedule, learner_step)
     if config.kind == "schedule":
         return np.full(num_arenas, epsilon, dtype=np.float32)
     exponents = ladder_exponents(num_actors, rank, num_arenas, config.ladder_power)

@@ -23,6 +23,7 @@ from common.network import (
     read_arrays,
     weights_to_bytes,
 )
+from common.schedule import value_at
 from services.learner.batch import Batch
 from services.learner.targets import double_dqn_target, dqn_target, td_loss
 
@@ -97,6 +98,7 @@ class Learner:
         loss, td_errors = td_loss(
             q, batch.action, target, batch.importance_weights, self.agent.loss
         )
+        self._set_learning_rate()
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         gradient_norm = self._clip_gradient()
@@ -170,6 +172,10 @@ class Learner:
     @property
     def _moments(self) -> tuple[str, ...]:
         return ("step", "exp_avg", "exp_avg_sq") if self._adam else ("step", "square_avg")
+
+    def _set_learning_rate(self) -> None:
+        factor = value_at(self.agent.learning_rate_schedule, self.learner_step)
+        self._optimizer.param_groups[0]["lr"] = self.agent.learning_rate * factor
 
     @property
     def _adam(self) -> bool:

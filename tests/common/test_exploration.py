@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from common.config import ExplorationConfig
 from common.errors import ConfigError
-from common.exploration import epsilon_at, epsilons, ladder_exponents
+from common.exploration import epsilons, ladder_exponents
+from common.schedule import value_at
 
 PAPER = ((0, 1.0), (800_000, 0.1))
 
@@ -17,13 +18,13 @@ PAPER = ((0, 1.0), (800_000, 0.1))
     [(0, 1.0), (400_000, 0.55), (800_000, 0.1), (5_000_000, 0.1)],
 )
 def test_the_papers_schedule(learner_step: int, epsilon: float) -> None:
-    assert epsilon_at(PAPER, learner_step) == pytest.approx(epsilon)
+    assert value_at(PAPER, learner_step) == pytest.approx(epsilon)
 
 
 def test_a_schedule_of_several_points_or_one() -> None:
     points = ((0, 1.0), (100, 0.1), (200, 0.02))
-    assert epsilon_at(points, 150) == pytest.approx(0.06)
-    assert epsilon_at(((0, 0.3),), 10**9) == 0.3
+    assert value_at(points, 150) == pytest.approx(0.06)
+    assert value_at(((0, 0.3),), 10**9) == 0.3
 
 
 def test_a_single_arena_has_exponent_one() -> None:

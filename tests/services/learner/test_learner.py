@@ -221,3 +221,30 @@ def test_diverged_weights_are_not_published() -> None:
 def test_a_device_that_is_none_is_refused(device: str) -> None:
     with pytest.raises(ConfigError, match=r"learner\.device"):
         make_learner(learner=LearnerConfig(device=device))
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
+def test_the_learning_rate_follows_its_schedule(optimizer: Literal["adam", "rmsprop"]) -> None:
+    """After the schedule has fallen a thousandfold a step changes next to nothing."""
+    agent = AgentConfig(
+        optimizer=optimizer,
+        learning_rate=1e-2,
+        optimizer_epsilon=1e-5,
+        learning_rate_schedule=((0, 1.0), (4, 1e-3)),
+    )
+    learner, batch = make_learner(agent), random_batch()
+    moved = []
+    for _ in range(6):
+        before = [p.detach().clone() for p in learner.online.parameters()]
+        learner.step(batch)
+        after = [p.detach() for p in learner.online.parameters()]
+        moved.append(max(float((a - b).abs().max()) for a, b in zip(after, before, strict=True)))
+    assert moved[0] > 100 * moved[4]
+    assert moved[4] == pytest.approx(moved[5], rel=2.0)
+
+
+def test_an_impossible_schedule_is_refused() -> None:
+    with pytest.raises(ValueError, match="learning_rate_schedule needs points"):
+        AgentConfig(learning_rate_schedule=((5, 1.0),))
+    with pytest.raises(ValueError, match="factor that is not above 0"):
+        AgentConfig(learning_rate_schedule=((0, 0.0),))
