@@ -26,7 +26,8 @@ def main(argv: Sequence[str]) -> int:
     if arguments.episodes < 1:
         parser.error(f"--episodes {arguments.episodes}: at least 1")
     judged = subject(arguments)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("episodes", total=arguments.episodes)
         result = judge(
             judged,

@@ -21,7 +21,8 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
     rate, z2 = successes / count, _Z95**2
     centre = (rate + z2 / (2 * count)) / (1 + z2 / count)
     half = _Z95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
-    return (max(0.0, centre - half), min(1.0, centre + half))
+    # At rates of 0 and 1 one bound is the rate itself; rounding would put it beside it.
+    return (min(rate, max(0.0, centre - half)), max(rate, min(1.0, centre + half)))
 
 
 def successes_per_100(results: Sequence[EpisodeResult]) -> list[float]:

@@ -87,7 +87,7 @@ def run(
             meter.timed("checkpoint", keeper.maybe_save)
         reporter.maybe(meter.metrics)
     writer.publish(keeper.next_weights())
-    keeper.save(final=True)
+    keeper.save()
     reporter.now(meter.metrics)
     _LOG.info("stopped at learner step %d", learner.learner_step)
 

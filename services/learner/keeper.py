@@ -59,12 +59,9 @@ class Keeper:
         if time.monotonic() - self._saved_s >= self._settings.checkpoint_period_s:
             self.save()
 
-    def save(self, *, final: bool = False) -> None:
-        """Write a checkpoint now; raises CheckpointError where that fails.
-
-        final: no weights will be published after this one.
-        """
-        reserved = self.version if final else self.version + _RESERVED_VERSIONS
+    def save(self) -> None:
+        """Write a checkpoint now; raises CheckpointError where that fails."""
+        reserved = self.version + _RESERVED_VERSIONS  # rises from save to save: it tells the newest
         checkpoint.save(
             self._directory,
             checkpoint.Checkpoint(

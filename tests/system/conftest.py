@@ -1,5 +1,7 @@
 """What the system tests share: one small finished run."""
 
+from pathlib import Path
+
 import pytest
 
 from tests.system.system_processes import (
@@ -7,9 +9,10 @@ from tests.system.system_processes import (
     Command,
     Finished,
     end_all,
+    eventually,
     processes_of,
     run_name,
-    shared_memory_files,
+    shared_memory_of,
 )
 
 
@@ -17,12 +20,16 @@ from tests.system.system_processes import (
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """`mrcdrl train --config smoke`, no terminal."""
     folder = tmp_path_factory.mktemp("finished")
-    name, before = run_name("smoke"), shared_memory_files()
+    name, mapped = run_name("smoke"), set[Path]()
+
+    def ended() -> bool:
+        mapped.update(shared_memory_of(name))
+        return train.process.poll() is not None
+
     arguments = ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
     with Command([*arguments, "--learner-steps", "60"], folder) as train:
-        code = train.wait(600)
+        eventually(ended, "the run ends by itself", 600, pause_s=1.0)
+        code = train.wait()
     left = processes_of(name)
     end_all(name)
-    return Finished(
-        name, folder / name, code, train.out, train.err, left, shared_memory_files() - before
-    )
+    return Finished(name, folder / name, code, train.out, train.err, left, mapped)

@@ -110,17 +110,22 @@ class Finished:
     out: str
     err: str
     processes_left: dict[int, str]
-    shared_memory_left: set[str]
+    shared_memory: set[Path]  # files that its processes had mapped
 
 
-def eventually(look: Callable[[], T | None], what: str, timeout_s: float = PATIENCE_S) -> T:
+def eventually(
+    look: Callable[[], T | None],
+    what: str,
+    timeout_s: float = PATIENCE_S,
+    pause_s: float = 0.05,
+) -> T:
     """What `look` returns as soon as that is true; fails after the time."""
     pause = threading.Event()
     deadline = time.monotonic() + timeout_s
     while not (found := look()):
         if time.monotonic() > deadline:
             raise AssertionError(f"in {timeout_s:g} s not: {what}")
-        pause.wait(0.05)
+        pause.wait(pause_s)
     return found
 
 
@@ -145,8 +150,16 @@ def end_all(name: str) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-def shared_memory_files() -> set[str]:
-    return {entry.name for entry in Path("/dev/shm").iterdir()}
+def shared_memory_of(name: str) -> set[Path]:
+    """Files below /dev/shm that a run's processes have mapped now."""
+    found = set()
+    for pid in processes_of(name):
+        try:
+            maps = Path(f"/proc/{pid}/maps").read_text("utf-8")
+        except OSError:  # it ended meanwhile
+            continue
+        found |= {Path(path) for path in re.findall(r"/dev/shm/\S+", maps)}
+    return found
 
 
 def error_line(stderr: str) -> str:

@@ -255,10 +255,21 @@ def disturb(
     publish_again: Callable[[], None],
 ) -> dict[str, list[float]]:
     """Collect while replay pauses and an actor dies; what each actor's starts had acknowledged."""
-    actors = {worker: Command(["actor", *joining, "--id", worker], folder) for worker in ACTORS}
+
+    def start(worker: str) -> Command:
+        settings = {
+            "MRCDRL_REPLAY__HOLD_S": "0.3"
+        }  # the run's: else so short a deadline is refused
+        return Command(["actor", *joining, "--id", worker], folder, **settings)
+
+    def all_live() -> None:
+        for actor in actors.values():
+            assert actor.process.poll() is None, actor.err
+
+    actors = {worker: start(worker) for worker in ACTORS}
     try:
         for worker in ACTORS:
-            listener.wait(worker, "inserts_acknowledged", 1)
+            listener.wait(worker, "inserts_acknowledged", 1, all_live)
         witness.sample(30)
         replay.signal(signal.SIGSTOP)
         listener.follow(2.0)
@@ -272,7 +283,7 @@ def disturb(
         assert dead.wait() == -signal.SIGKILL
         listener.follow(0.5)
         listener.latest.pop("actor-0", None)
-        actors["actor-0"] = Command(["actor", *joining, "--id", "actor-0"], folder)
+        actors["actor-0"] = start("actor-0")
         listener.wait("actor-0", "inserts_acknowledged", 30, lambda: witness.sample(4))
         for actor in actors.values():
             assert actor.end() == 0, actor.err

@@ -30,7 +30,7 @@ from tests.system.system_processes import (
     eventually,
     processes_of,
     run_name,
-    shared_memory_files,
+    shared_memory_of,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -71,7 +71,7 @@ def test_a_run_ends_by_itself_and_prints_plain_lines(finished: Finished) -> None
 
 def test_nothing_of_a_finished_run_is_left_behind(finished: Finished) -> None:
     assert finished.processes_left == {}
-    assert finished.shared_memory_left == set()
+    assert not [path for path in finished.shared_memory if path.exists()]
     no_trace_of(finished.name, finished.path)
 
 
@@ -138,7 +138,7 @@ def test_resume_goes_on_until_interrupted(finished: Finished, tmp_path: Path) ->
     assert loaded is not None
     assert loaded.passed_over == ()
     assert loaded.checkpoint.state.learner_step == after["learner_steps"]
-    assert loaded.checkpoint.weights_version == after["weights_version"]
+    assert loaded.checkpoint.weights_version >= int(str(after["weights_version"]))
     steps = [record.learner_steps for record in read_episodes(run)]
     assert steps == sorted(steps)
 
@@ -185,7 +185,7 @@ def service_process(name: str, role: str) -> int | None:
 
 
 def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: Path) -> None:
-    name, before = run_name("screen"), shared_memory_files()
+    name = run_name("screen")
     run = tmp_path / name
     terminal = Terminal()
     arguments = ["train", "--config", "smoke", "--run-dir", tmp_path, "--name", name, *SMALL]
@@ -206,7 +206,9 @@ def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: P
                 *("successes of the last", "limited by", "evaluation", "left"),
             ):
                 assert word in terminal.text, word
+            mapped = shared_memory_of(name)
             _kill_and_see_it_back(run, name, terminal, train)
+            mapped |= shared_memory_of(name)
             terminal.type(b"\x03")
             terminal.read(lambda: train.process.poll() is not None, "the end")
             assert train.wait() == 0, terminal.text[-3000:]
@@ -216,7 +218,7 @@ def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: P
         assert b"\x1b[?25h" in terminal.raw  # the cursor shown again
         assert "Traceback" not in terminal.text
         no_trace_of(name, run)
-        assert shared_memory_files() <= before
+        assert not [path for path in mapped if path.exists()]
         assert checkpoint.load_latest(run / "checkpoints") is not None
     finally:
         terminal.close()
