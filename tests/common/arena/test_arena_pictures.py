@@ -132,15 +132,15 @@ def test_records_are_the_scene_as_each_robot_lists_it() -> None:
 
 @pytest.mark.parametrize("kind", ["scene", "frames"])
 def test_decode_keeps_leading_axes_and_fills_out(kind: str) -> None:
-    config = ArenaConfig.model_validate({"codec": kind, "view_px": 24})
+    config = ArenaConfig.model_validate({"codec": kind, "view_px": 32})
     codec = make_codec(config)
     records = codec.encode(scenes(config, 1)[0])
     expected = codec.decode(records)
     many = np.broadcast_to(records, (3, 5, *records.shape))  # read-only, and not contiguous
-    out = np.full((3, 5, 2, 24, 24), 9, np.uint8)
+    out = np.full((3, 5, 2, 32, 32), 9, np.uint8)
     assert codec.decode(many, out) is out
     np.testing.assert_array_equal(out, np.broadcast_to(expected, out.shape))
-    assert codec.decode(records[:0]).shape == (0, 24, 24)
+    assert codec.decode(records[:0]).shape == (0, 32, 32)
     packed = np.frombuffer(b"x" + records.tobytes(), np.uint8)[1:].reshape(records.shape)
     np.testing.assert_array_equal(codec.decode(packed), expected)
 
@@ -176,7 +176,7 @@ def test_any_record_gives_some_picture(numbers: list[float], orientation: str) -
     assert codec.decode(records).shape == (60, 60)
 
 
-@pytest.mark.parametrize("view_px", [12, 60, 255])
+@pytest.mark.parametrize("view_px", [31, 60, 255])
 @pytest.mark.parametrize("crop_px", [50.0, 333.3, 5000.0])
 def test_any_size_of_picture(view_px: int, crop_px: float) -> None:
     for orientation in ("unrotated", "heading_up"):
