@@ -1,0 +1,96 @@
+"""Non-negative numbers with their sum, drawn in proportion to what they are (Schaul et al. 2016).
+
+Invariants (`check_invariants`): a node is the sum of its two children as computed last, never
+changed by a difference, so errors of rounding do not add up; an index whose value is 0 is never
+drawn. Pure numpy: each call works on all its indices at once, level by level.
+"""
+
+import numpy as np
+
+from common.trajectory import Float64Array, Int64Array
+
+
+class SumTree:
+    """`size` values, 0 at first, as the leaves of a binary tree of float64 sums."""
+
+    def __init__(self, size: int) -> None:
+        if size < 1:
+            raise ValueError("a sum tree needs at least one leaf")
+        self._size = size
+        self._depth = (size - 1).bit_length()
+        self._first_leaf = 1 << self._depth
+        # Node i has the children 2i and 2i + 1; 1 is the root, 0 is unused.
+        self._nodes: Float64Array = np.zeros(2 * self._first_leaf, np.float64)
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def total(self) -> float:
+        """Sum of all values."""
+        return float(self._nodes[1])
+
+    @property
+    def nbytes(self) -> int:
+        return self._nodes.nbytes
+
+    def get(self, indices: Int64Array) -> Float64Array:
+        """The values at these indices, float64 [len(indices)]."""
+        self._check(indices)
+        return self._nodes[indices + self._first_leaf]
+
+    def set(self, indices: Int64Array, values: Float64Array) -> None:
+        """Put values, float64 [len(indices)], at indices; of one given twice the last counts.
+
+        Raises ValueError for a value that is negative or not finite, or an index that is none.
+        """
+        self._check(indices)
+        if not (np.isfinite(values).all() and (values >= 0).all()):
+            raise ValueError("a value is negative or not finite")
+        nodes = indices + self._first_leaf
+        self._nodes[nodes] = values
+        for _ in range(self._depth):
+            nodes >>= 1
+            self._nodes[nodes] = self._nodes[2 * nodes] + self._nodes[2 * nodes + 1]
+
+    def sample(self, uniforms: Float64Array) -> Int64Array:
+        """As many indices as there are uniform numbers in 0 ... 1 (1 excluded), stratified.
+
+        The total is cut into as many equal parts, and one index drawn of each, so that index i is
+        expected len(uniforms) x value / total times. Raises ValueError when all values are 0.
+        """
+        if self._nodes[1] == 0:
+            raise ValueError("nothing to draw: all values are 0")
+        count = len(uniforms)
+        nodes = np.ones(count, np.int64)
+        left_over = _below(
+            (np.arange(count) + uniforms) / count * self._nodes[1], self._nodes[nodes]
+        )
+        for _ in range(self._depth):
+            nodes *= 2
+            lefts = self._nodes[nodes]
+            right = left_over >= lefts
+            nodes += right
+            left_over = _below(left_over - lefts * right, self._nodes[nodes])
+        return nodes - self._first_leaf
+
+    def _check(self, indices: Int64Array) -> None:
+        if len(indices) and (indices.min() < 0 or indices.max() >= self._size):
+            raise ValueError(f"an index is outside 0 ... {self._size - 1}")
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError where a node is not the sum of its children, or negative."""
+        inner = np.arange(1, self._first_leaf)
+        sums = self._nodes[2 * inner] + self._nodes[2 * inner + 1]
+        if not np.array_equal(self._nodes[inner], sums):
+            raise AssertionError("a node is not the sum of its children")
+        if (self._nodes < 0).any() or self._nodes[self._first_leaf + self._size :].any():
+            raise AssertionError("a value is negative, or lies beyond the last index")
+
+
+def _below(targets: Float64Array, sums: Float64Array) -> Float64Array:
+    """Targets held below the sums they fall into; rounding may have put them on the edge.
+
+    A target below a sum leads to a child with a sum above 0, and so on down to a leaf above 0.
+    """
+    return np.minimum(targets, np.nextafter(sums, 0.0))
