@@ -185,6 +185,11 @@ class ReplayConfig(Section):
     """Transitions; the oldest are replaced. (paper)"""
     min_size: Count = 50_000
     """Transitions before the first sample is given. (paper)"""
+    sampler: Literal["uniform", "prioritized"] = "uniform"
+    """`uniform`: each transition as likely as any other. `prioritized`: in proportion to its last
+    absolute TD error, to the power priority_exponent. (paper; Ape-X: prioritized)"""
+    priority_exponent: Fraction = 0.6
+    """alpha of prioritized sampling; 0 is uniform. (Ape-X)"""
     samples_per_insert: Annotated[float, Field(ge=0)] = 8.0
     """Transitions sampled for each inserted; both sides are held to it; 0: no limit. (ours)"""
     tolerance: Annotated[float, Field(ge=0)] = 0.1
@@ -207,6 +212,11 @@ class ReplayConfig(Section):
                 "sampling would never start"
             )
         return self
+
+    @property
+    def prioritized(self) -> bool:
+        """Whether TD errors decide what is sampled."""
+        return self.sampler == "prioritized"
 
 
 class ActorConfig(Section):

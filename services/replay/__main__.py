@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from common.arguments import Parser, add_config_flags, overrides
-from common.config import Config, load_config, to_toml
+from common.config import Config, ReplayConfig, load_config, to_toml
 from common.keys import Keys, check_name
 from common.process import StatsReporter, StopSignal, run_main
 from common.transport import Session
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
+from services.replay.sampler import PrioritizedSampler, Sampler, UniformSampler
 from services.replay.service import ReplayService
 from services.replay.table import Table
 
@@ -86,7 +87,7 @@ def build(config: Config) -> tuple[Table, RateLimiter]:
         n_step=config.agent.n_step,
         chunk_length=config.actor.chunk_length,
         record_bytes=config.arena.record_bytes,
-        rng=np.random.default_rng(config.replay.seed),
+        sampler=make_sampler(config.replay),
     )
     limiter = RateLimiter.with_tolerance(
         config.replay.samples_per_insert,
@@ -96,6 +97,14 @@ def build(config: Config) -> tuple[Table, RateLimiter]:
         largest_sample=config.learner.batch_size,
     )
     return table, limiter
+
+
+def make_sampler(replay: ReplayConfig) -> Sampler:
+    """The sampler a configuration asks for."""
+    rng = np.random.default_rng(replay.seed)
+    if replay.prioritized:
+        return PrioritizedSampler(replay.capacity, replay.priority_exponent, rng)
+    return UniformSampler(rng)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from common.errors import ConfigError, WireError
-from common.trajectory import Chunk, Samples, UInt8Array
+from common.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
+from services.replay.sampler import Sampler
 
 _CHUNK_ENDS = 2.0  # history and tail a full chunk's length of transitions: last chunks are short
 
@@ -28,12 +29,12 @@ class _Extent:
 
 
 class Table:
-    """First in, first out, sampled uniformly with replacement.
+    """First in, first out; a sampler says which transitions are drawn.
 
     capacity: transitions. stack: records of a state. n_step: longest return; a transition
     touches a window of stack + n_step records. chunk_length: transitions of most chunks; many
-    shorter ones leave less than the capacity. record_bytes: length of one record. rng: draws the
-    samples.
+    shorter ones leave less than the capacity. record_bytes: length of one record. sampler: of the
+    same capacity, for this table alone.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class Table:
         n_step: int,
         chunk_length: int,
         record_bytes: int,
-        rng: np.random.Generator,
+        sampler: Sampler,
     ) -> None:
         window = stack + n_step
         num_rows = int(capacity * (1 + _CHUNK_ENDS * (window - 1) / chunk_length)) + 2 * window
@@ -68,7 +69,7 @@ class Table:
         self._extents: deque[_Extent] = deque()
         self._next_key = 0
         self._next_row = 0
-        self._rng = rng
+        self._sampler = sampler
 
     def __len__(self) -> int:
         return self._next_key - self.first_key
@@ -90,6 +91,11 @@ class Table:
         self._next_key = key
 
     @property
+    def keys(self) -> range:
+        """Of the transitions there are now."""
+        return range(self.first_key, self._next_key)
+
+    @property
     def capacity(self) -> int:
         return self._capacity
 
@@ -105,7 +111,7 @@ class Table:
             self._bootstrap_offsets,
             self._weights_versions,
         )
-        return sum(column.nbytes for column in columns)
+        return sum(column.nbytes for column in columns) + self._sampler.nbytes
 
     def check(self, chunk: Chunk) -> None:
         """Raise WireError where the chunk does not fit this table."""
@@ -125,7 +131,9 @@ class Table:
         """Append the chunk's transitions; the oldest chunks make room."""
         self.check(chunk)
         length, num_rows = len(chunk), len(chunk.records)
+        oldest = self.first_key
         first_row = self._make_room(length, num_rows)
+        self._sampler.evict(range(oldest, self.first_key))
         self._rows[first_row : first_row + num_rows] = chunk.records
         slots = (self._next_key + np.arange(length)) % self._capacity
         self._start_rows[slots] = first_row + np.arange(length)
@@ -137,18 +145,26 @@ class Table:
         self._extents.append(_Extent(self._next_key, length, first_row, num_rows))
         self._next_key += length
         self._next_row = first_row + num_rows
+        self._sampler.insert(range(self._next_key - length, self._next_key), chunk.priorities)
+
+    def update_priorities(self, keys: Int64Array, priorities: Float32Array) -> int:
+        """Give transitions new absolute TD errors, both [N]; how many of them were taken.
+
+        Those that were evicted meanwhile are ignored; so are all where sampling is uniform.
+        """
+        there = (keys >= self.first_key) & (keys < self._next_key)
+        return self._sampler.update(keys[there], priorities[there])
 
     def sample(self, size: int) -> Samples:
-        """`size` transitions, each as likely as any other; ValueError when the table is empty."""
-        num_transitions = len(self)
-        if num_transitions == 0:
+        """`size` transitions as the sampler draws them; ValueError when the table is empty."""
+        if len(self) == 0:
             raise ValueError("cannot sample from an empty table")
-        keys = self.first_key + self._rng.integers(0, num_transitions, size)
+        keys, probabilities = self._sampler.sample(self.keys, size)
         slots = keys % self._capacity
         return Samples(
             keys=keys,
-            probabilities=np.full(size, 1.0 / num_transitions),
-            table_size=num_transitions,
+            probabilities=probabilities,
+            table_size=len(self),
             records=self._windows[self._start_rows[slots]],
             actions=self._actions[slots],
             rewards=self._rewards[slots],
@@ -188,3 +204,4 @@ class Table:
             taken[rows] = True
         if key != self._next_key or len(self) > self._capacity:
             raise AssertionError("keys are not the newest of all inserted, or exceed the capacity")
+        self._sampler.check_invariants(self.keys)

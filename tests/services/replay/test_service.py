@@ -16,6 +16,7 @@ from common.config import Config, ReplayConfig, TransportConfig
 from common.trajectory import Chunk, InsertReply, Samples, Stats
 from common.wire import SampleRequest, decode, encode
 from services.replay.limiter import RateLimiter
+from services.replay.sampler import UniformSampler
 from services.replay.service import ReplayService
 from services.replay.table import Table
 
@@ -106,7 +107,7 @@ def replay(
         replay=ReplayConfig(capacity=1000, min_size=100, hold_s=hold_s),
         transport=TransportConfig(timeout_s=2 * hold_s),
     )
-    table = Table(1000, 2, 1, LENGTH, 4, np.random.default_rng(0))
+    table = Table(1000, 2, 1, LENGTH, 4, UniformSampler(np.random.default_rng(0)))
     limiter = RateLimiter(ratio, min_size, buffer, LENGTH, BATCH)
     inserts, samples = FakeServer(), FakeServer()
     service = ReplayService(config, table, limiter, inserts, samples)

@@ -1,6 +1,9 @@
-"""The table against a plain list of transitions: same data, same keys, oldest out first."""
+"""The table against a plain list of transitions: same data, same keys, oldest out first.
 
-from collections.abc import Callable
+With both samplers; how prioritized draws are spread and weighed is in test_sampler.py.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import hypothesis.strategies as st
@@ -16,13 +19,22 @@ from hypothesis.stateful import (
 )
 
 from common.errors import WireError
-from common.trajectory import Chunk, UInt8Array
+from common.trajectory import Chunk, Float64Array, Int64Array, UInt8Array
+from services.replay.sampler import PrioritizedSampler, UniformSampler
 from services.replay.table import Table
 
 RECORD_BYTES = 4
+EXPONENT = 0.6
 
 
-def make_chunk(number: int, length: int, *, stack: int = 4, n_step: int = 1) -> Chunk:
+def make_chunk(
+    number: int,
+    length: int,
+    *,
+    stack: int = 4,
+    n_step: int = 1,
+    priorities: Sequence[float] = (),
+) -> Chunk:
     """Chunk `number`, its records and columns unlike those of any other of 65536."""
     rows = np.arange(stack - 1 + length + n_step, dtype=np.uint16)
     marks = np.stack([np.full_like(rows, number), rows], axis=1)
@@ -37,15 +49,19 @@ def make_chunk(number: int, length: int, *, stack: int = 4, n_step: int = 1) -> 
         rewards=(number + steps / 1024).astype(np.float32),
         discounts=(1 / (1 + number + steps)).astype(np.float32),
         bootstrap_offsets=(1 + (number + steps) % n_step).astype(np.uint8),
-        priorities=np.empty(0, np.float32),
+        priorities=np.array(priorities, np.float32),
     )
 
 
 CHUNK_LENGTH = 8
 
 
-def make_table(capacity: int, *, stack: int = 4, n_step: int = 1, seed: int = 0) -> Table:
-    return Table(capacity, stack, n_step, CHUNK_LENGTH, RECORD_BYTES, np.random.default_rng(seed))
+def make_table(
+    capacity: int, *, stack: int = 4, n_step: int = 1, seed: int = 0, prioritized: bool = False
+) -> Table:
+    rng = np.random.default_rng(seed)
+    sampler = PrioritizedSampler(capacity, EXPONENT, rng) if prioritized else UniformSampler(rng)
+    return Table(capacity, stack, n_step, CHUNK_LENGTH, RECORD_BYTES, sampler)
 
 
 @dataclass(frozen=True)
@@ -60,22 +76,40 @@ class Transition:
     version: int
 
 
-class TableAgainstList(RuleBasedStateMachine):
-    """Every transition ever inserted stands in a list, at its key."""
+PRIORITIES = st.floats(0, 1000, width=32)
 
-    @initialize(capacity=st.integers(1, 40), stack=st.integers(1, 4), n_step=st.integers(1, 3))
-    def make(self, capacity: int, stack: int, n_step: int) -> None:
+
+class TableAgainstList(RuleBasedStateMachine):
+    """Every transition ever inserted stands in a list, at its key, and so does its priority."""
+
+    @initialize(
+        capacity=st.integers(1, 40),
+        stack=st.integers(1, 4),
+        n_step=st.integers(1, 3),
+        prioritized=st.booleans(),
+    )
+    def make(self, capacity: int, stack: int, n_step: int, prioritized: bool) -> None:
         self.capacity, self.stack, self.n_step = capacity, stack, n_step
-        self.table = make_table(capacity, stack=stack, n_step=n_step)
+        self.prioritized = prioritized
+        self.table = make_table(capacity, stack=stack, n_step=n_step, prioritized=prioritized)
         self.model: list[Transition] = []
+        self.priorities: list[float] = []
+        self.largest = 1.0
         self.lengths: list[int] = []
 
     @rule(data=st.data(), times=st.integers(1, 4))
     def insert(self, data: st.DataObject, times: int) -> None:
         for _ in range(times):
             length = data.draw(st.integers(1, min(self.capacity, 12)))
-            chunk = make_chunk(len(self.lengths), length, stack=self.stack, n_step=self.n_step)
+            given = data.draw(
+                st.one_of(st.just([]), st.lists(PRIORITIES, min_size=length, max_size=length))
+            )
+            chunk = make_chunk(
+                len(self.lengths), length, stack=self.stack, n_step=self.n_step, priorities=given
+            )
             self.table.insert(chunk)
+            self.priorities += given or [self.largest] * length
+            self.largest = max(self.largest, *given, 0.0)
             self.lengths.append(length)
             self.model += [
                 Transition(
@@ -89,16 +123,30 @@ class TableAgainstList(RuleBasedStateMachine):
                 for t in range(length)
             ]
 
+    @rule(data=st.data())
+    def update_priorities(self, data: st.DataObject) -> None:
+        keys = data.draw(st.lists(st.integers(-3, len(self.model) + 3), max_size=12))
+        given = data.draw(st.lists(PRIORITIES, min_size=len(keys), max_size=len(keys)))
+        taken = self.table.update_priorities(np.array(keys, np.int64), np.array(given, np.float32))
+        there = [
+            (key, priority)
+            for key, priority in zip(keys, given, strict=True)
+            if self.oldest <= key < len(self.model)
+        ]
+        assert taken == (len(there) if self.prioritized else 0)
+        for key, priority in there:
+            self.priorities[key] = priority
+            self.largest = max(self.largest, priority)
+
     @precondition(lambda self: self.model)
     @rule(size=st.integers(1, 64))
     def sample(self, size: int) -> None:
         samples = self.table.sample(size)
-        oldest = len(self.model) - len(self.table)
         assert len(samples) == size
         assert samples.table_size == len(self.table)
-        assert samples.probabilities.tolist() == [1 / len(self.table)] * size
+        np.testing.assert_allclose(samples.probabilities, self.probabilities(samples.keys), 1e-9)
         for index, key in enumerate(samples.keys.tolist()):
-            assert oldest <= key < len(self.model)
+            assert self.oldest <= key < len(self.model)
             expected = self.model[key]
             np.testing.assert_array_equal(samples.records[index], expected.records)
             assert samples.actions[index] == expected.action
@@ -106,6 +154,18 @@ class TableAgainstList(RuleBasedStateMachine):
             assert samples.discounts[index] == expected.discount
             assert samples.bootstrap_offsets[index] == expected.offset
             assert samples.weights_versions[index] == expected.version
+
+    @property
+    def oldest(self) -> int:
+        return len(self.model) - len(self.table)
+
+    def probabilities(self, keys: Int64Array) -> Float64Array:
+        """Of these keys, by definition."""
+        if not self.prioritized:
+            return np.full(len(keys), 1 / len(self.table))
+        shares = (np.array(self.priorities) + 1e-6) ** EXPONENT
+        shares[: self.oldest] = 0
+        return shares[keys] / shares.sum()
 
     @invariant()
     def holds_the_newest_whole_chunks(self) -> None:
@@ -143,8 +203,9 @@ def test_each_transition_is_drawn_as_often_as_any_other() -> None:
     assert chi_square < 266.4  # 99.9 % of chi-square with 199 degrees of freedom
 
 
-def test_the_same_seed_draws_the_same() -> None:
-    tables = [make_table(20, seed=3), make_table(20, seed=3)]
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_the_same_seed_draws_the_same(prioritized: bool) -> None:
+    tables = [make_table(20, seed=3, prioritized=prioritized) for _ in range(2)]
     for table in tables:
         table.insert(make_chunk(0, 20))
     first, second = (table.sample(50).keys for table in tables)
@@ -175,7 +236,10 @@ def test_a_chunk_of_other_settings_is_refused(chunk: Callable[[], Chunk], reason
 
 
 def test_memory_is_the_rows_and_the_columns() -> None:
-    table = Table(1000, 4, 1, 50, 80, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    table = Table(1000, 4, 1, 50, 80, UniformSampler(rng))
     per_transition = 8 + 1 + 4 + 4 + 1 + 8
     assert table.nbytes == (1160 + 2 * 5) * 80 + 1000 * per_transition
     assert table.capacity == 1000
+    prioritized = Table(1000, 4, 1, 50, 80, PrioritizedSampler(1000, EXPONENT, rng))
+    assert prioritized.nbytes == table.nbytes + 2 * 1024 * 8
