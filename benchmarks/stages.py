@@ -106,9 +106,8 @@ def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> d
         Session(TransportConfig(listen=(endpoint,))) as served,
         Session(TransportConfig(connect=(endpoint,))) as session,
     ):
-        service = ReplayService(
-            config, table, limiter, served.server(keys.insert()), served.server(keys.sample())
-        )
+        servers = map(served.server, (keys.insert(), keys.sample(), keys.priorities()))
+        service = ReplayService(config, table, limiter, *servers)
         service.start()
         writer = ReplayWriter(session, keys, 10.0, stop)
         reader = ReplayReader(session, keys, config.learner.batch_size, 4, 10.0, stop)

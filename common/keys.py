@@ -2,6 +2,7 @@
 
 mrcdrl/<run>/replay/<shard>/insert     query: Chunk -> InsertReply
 mrcdrl/<run>/replay/<shard>/sample     query: SampleRequest -> Samples
+mrcdrl/<run>/replay/<shard>/priorities query: Priorities -> PrioritiesReply
 mrcdrl/<run>/config                    query: nothing -> the configuration as TOML
 mrcdrl/<run>/weights                   publication and query: Weights
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
@@ -41,6 +42,9 @@ class Keys:
 
     def sample(self, shard: int = 0) -> str:
         return f"mrcdrl/{self.run}/replay/{shard}/sample"
+
+    def priorities(self, shard: int = 0) -> str:
+        return f"mrcdrl/{self.run}/replay/{shard}/priorities"
 
     @property
     def config(self) -> str:

@@ -112,6 +112,22 @@ class InsertReply:
 
 
 @dataclass(frozen=True, slots=True)
+class Priorities:
+    """What a learner found of transitions it sampled; of a key given twice the last counts."""
+
+    keys: Int64Array  # [B], of Samples
+    priorities: Float32Array  # [B], absolute TD errors
+
+
+@dataclass(frozen=True, slots=True)
+class PrioritiesReply:
+    """Replay's acknowledgement of priorities."""
+
+    updated: int
+    ignored: int  # of transitions evicted meanwhile; all of them where sampling is uniform
+
+
+@dataclass(frozen=True, slots=True)
 class Weights:
     """The network's parameters as published; newer means a larger (epoch, version)."""
 

@@ -22,7 +22,10 @@ from common.trajectory import (
     Chunk,
     EpisodeSummary,
     Evaluation,
+    Float32Array,
     InsertReply,
+    Priorities,
+    PrioritiesReply,
     Samples,
     Stats,
     Weights,
@@ -52,7 +55,7 @@ def _check_chunk(chunk: Chunk) -> str | None:
         return "records is no matrix with more rows than there are transitions"
     if not (np.isfinite(chunk.rewards).all() and np.isfinite(chunk.discounts).all()):
         return "a reward or discount is not finite"
-    if not (np.isfinite(chunk.priorities).all() and (chunk.priorities >= 0).all()):
+    if not _may_be_errors(chunk.priorities):
         return "a priority is negative or not finite"
     if chunk.actions.max() >= NUM_ACTIONS:
         return f"an action is none of {NUM_ACTIONS}"
@@ -78,7 +81,22 @@ def _check_samples(samples: Samples) -> str | None:
     )
     if any(v.ndim != 1 or len(v) != size for v in vectors) or len(samples.records) != size:
         return "arrays differ in length"
+    if not ((samples.probabilities > 0).all() and (samples.probabilities <= 1).all()):
+        return "a probability is not above 0 and at most 1"
     return None
+
+
+def _check_priorities(message: Priorities) -> str | None:
+    if message.keys.ndim != 1 or message.keys.shape != message.priorities.shape:
+        return "keys and priorities are no vectors of one length"
+    if not _may_be_errors(message.priorities):
+        return "a priority is negative or not finite"
+    return None
+
+
+def _may_be_errors(priorities: Float32Array) -> bool:
+    """Whether these are absolute TD errors."""
+    return bool(np.isfinite(priorities).all() and (priorities >= 0).all())
 
 
 _SCHEMAS: dict[type, str] = {
@@ -86,12 +104,18 @@ _SCHEMAS: dict[type, str] = {
     InsertReply: "insert_reply/1",
     SampleRequest: "sample_request/1",
     Samples: "samples/1",
+    Priorities: "priorities/1",
+    PrioritiesReply: "priorities_reply/1",
     Weights: "weights/1",
     EpisodeSummary: "episode/1",
     Evaluation: "evaluation/1",
     Stats: "stats/1",
 }
-_CHECKS: dict[type, Callable[[Any], str | None]] = {Chunk: _check_chunk, Samples: _check_samples}
+_CHECKS: dict[type, Callable[[Any], str | None]] = {
+    Chunk: _check_chunk,
+    Samples: _check_samples,
+    Priorities: _check_priorities,
+}
 
 
 def encode(message: Any) -> bytes:

@@ -27,6 +27,8 @@ from common.trajectory import (
     Evaluation,
     InsertReply,
     Outcome,
+    Priorities,
+    PrioritiesReply,
     Samples,
     Stats,
     Weights,
@@ -50,6 +52,8 @@ MESSAGES = (
     InsertReply,
     SampleRequest,
     Samples,
+    Priorities,
+    PrioritiesReply,
     Weights,
     EpisodeSummary,
     Evaluation,
@@ -248,7 +252,7 @@ def published(role: str) -> set[str]:
     """Names of a role's metrics: told by the code where that is cheap, read in it elsewhere."""
     if role == "replay":
         config = Config()
-        return set(ReplayService(config, *build(config), MagicMock(), MagicMock()).metrics())
+        return set(ReplayService(config, *build(config), *[MagicMock()] * 3).metrics())
     if role == "learner":
         meter = Meter(MagicMock(), MagicMock(), MagicMock())
         meter.last = MagicMock()

@@ -48,8 +48,9 @@ def main(argv: Sequence[str]) -> int:
     with Session(transport) as session:
         configs = session.server(keys.config)
         inserts, samples = session.server(keys.insert()), session.server(keys.sample())
+        priorities = session.server(keys.priorities())
         reporter = StatsReporter(session.publisher(keys.stats("replay", worker)), "replay", worker)
-        service = ReplayService(config, table, limiter, inserts, samples, log)
+        service = ReplayService(config, table, limiter, inserts, samples, priorities, log)
         service.recover()
         service.start()
         session.announce(keys.live("replay", worker))

@@ -1,4 +1,4 @@
-"""The shell around the table: one thread inserts, one samples, under one lock.
+"""The shell around the table: threads that insert, sample and set priorities, under one lock.
 
 Invariants: a chunk is acknowledged only after it is in the log and the table; a request is
 answered within `hold_s`: by the data, a refusal with its reason, or "held", which asks the peer
@@ -13,7 +13,7 @@ from typing import Protocol
 from common.config import Config
 from common.errors import WireError
 from common.files import reason
-from common.trajectory import Chunk, InsertReply
+from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply
 from common.wire import SampleRequest, decode, encode
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
@@ -22,6 +22,10 @@ from services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
 _TAKE_S = 0.2  # how soon a thread sees that it is to stop
+_COUNTS = (
+    *("chunks", "duplicates", "gaps", "refused", "log_errors"),
+    *("priority_updates", "priorities_ignored"),
+)
 
 
 class _Request(Protocol):
@@ -40,7 +44,7 @@ class _Server(Protocol):
 
 
 class ReplayService:
-    """Serves inserts and samples until `stop`."""
+    """Serves inserts, samples and priorities until `stop`."""
 
     def __init__(
         self,
@@ -49,6 +53,7 @@ class ReplayService:
         limiter: RateLimiter,
         inserts: _Server,
         samples: _Server,
+        priorities: _Server,
         log: SegmentLog | None = None,
     ) -> None:
         """log: what outlives the process; None: nothing does."""
@@ -60,11 +65,14 @@ class ReplayService:
         self._earlier = 0  # transitions of earlier processes that were evicted
         self._changed = threading.Condition()
         self._stopping = threading.Event()
-        self._counts = dict.fromkeys(("chunks", "duplicates", "gaps", "refused", "log_errors"), 0)
+        self._counts = dict.fromkeys(_COUNTS, 0)
         self._held = {"insert_held": False, "sample_held": False}
         self._threads = [
             threading.Thread(target=self._serve, args=(inserts, self._insert), name="insert"),
             threading.Thread(target=self._serve, args=(samples, self._sample), name="sample"),
+            threading.Thread(
+                target=self._serve, args=(priorities, self._prioritize), name="priorities"
+            ),
         ]
 
     def recover(self) -> None:
@@ -92,7 +100,7 @@ class ReplayService:
             thread.start()
 
     def stop(self) -> None:
-        """Answer what is being served, then end both threads."""
+        """Answer what is being served, then end all threads."""
         self._stopping.set()
         with self._changed:
             self._changed.notify_all()
@@ -101,7 +109,7 @@ class ReplayService:
 
     @property
     def healthy(self) -> bool:
-        """Both threads live; one that died of a bug of ours ends the service."""
+        """All threads live; one that died of a bug of ours ends the service."""
         return all(thread.is_alive() for thread in self._threads)
 
     def metrics(self) -> dict[str, float]:
@@ -204,6 +212,15 @@ class ReplayService:
             self._limiter.samples += size
             self._changed.notify_all()
         request.reply(encode(samples))
+
+    def _prioritize(self, request: _Request) -> None:
+        message = decode(Priorities, request.payload)
+        with self._changed:
+            updated = self._table.update_priorities(message.keys, message.priorities)
+            ignored = len(message.keys) - updated
+            self._counts["priority_updates"] += updated
+            self._counts["priorities_ignored"] += ignored
+        request.reply(encode(PrioritiesReply(updated, ignored)))
 
     def _wait(self, flag: str, request: _Request, ready: "_Ready") -> bool:
         """Wait, the lock given up meanwhile, until ready; False where that took too long."""

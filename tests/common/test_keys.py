@@ -44,6 +44,8 @@ def test_the_keys_of_a_run() -> None:
         keys.sample(): "mrcdrl/run-1/replay/0/sample",
         keys.insert(2): "mrcdrl/run-1/replay/2/insert",
         keys.sample(2): "mrcdrl/run-1/replay/2/sample",
+        keys.priorities(): "mrcdrl/run-1/replay/0/priorities",
+        keys.priorities(2): "mrcdrl/run-1/replay/2/priorities",
         keys.config: "mrcdrl/run-1/config",
         keys.weights: "mrcdrl/run-1/weights",
         keys.evaluation("e"): "mrcdrl/run-1/evaluation/e",
@@ -58,7 +60,7 @@ def test_the_keys_of_a_run() -> None:
     }
     for key, literal in expected.items():
         assert key == literal
-    assert len(expected) == 15
+    assert len(expected) == 17
 
 
 def test_role_and_worker_are_read_back_from_a_live_key() -> None:

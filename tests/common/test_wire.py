@@ -18,6 +18,8 @@ from common.trajectory import (
     Evaluation,
     InsertReply,
     Outcome,
+    Priorities,
+    PrioritiesReply,
     Samples,
     Stats,
     Weights,
@@ -63,7 +65,7 @@ def samples(draw: st.DrawFn) -> Samples:
     size, window, record_bytes = draw(st.tuples(*[st.integers(0, 5)] * 3))
     return Samples(
         keys=draw(arrays("i8", size)),
-        probabilities=draw(arrays("f8", size, **FINITE)),
+        probabilities=draw(arrays("f8", size, min_value=1e-300, max_value=1)),
         table_size=draw(COUNTS),
         records=draw(arrays("u1", size, window, record_bytes)),
         actions=draw(arrays("u1", size)),
@@ -71,6 +73,15 @@ def samples(draw: st.DrawFn) -> Samples:
         discounts=draw(arrays("f4", size, **FINITE)),
         bootstrap_offsets=draw(arrays("u1", size)),
         weights_versions=draw(arrays("i8", size)),
+    )
+
+
+@st.composite
+def priorities(draw: st.DrawFn) -> Priorities:
+    size = draw(st.integers(0, 6))
+    return Priorities(
+        keys=draw(arrays("i8", size)),
+        priorities=draw(arrays("f4", size, min_value=0, **FINITE)),
     )
 
 
@@ -110,10 +121,12 @@ EVALUATIONS = st.builds(
 MESSAGES = st.one_of(
     chunks(),
     samples(),
+    priorities(),
     EPISODES,
     EVALUATIONS,
     st.builds(InsertReply, sequence=INTS, duplicate=st.booleans(), inserts=INTS),
     st.builds(SampleRequest, batch_size=INTS),
+    st.builds(PrioritiesReply, updated=INTS, ignored=INTS),
     st.builds(Weights, epoch=INTS, version=INTS, learner_step=INTS, payload=st.binary()),
     st.builds(
         Stats,
@@ -130,6 +143,8 @@ CLASSES = (
     Evaluation,
     InsertReply,
     SampleRequest,
+    Priorities,
+    PrioritiesReply,
     Weights,
     Stats,
 )
@@ -178,6 +193,18 @@ CHUNK = Chunk(
     bootstrap_offsets=np.array([1, 1], np.uint8),
     priorities=np.empty(0, np.float32),
 )
+SAMPLES = Samples(
+    keys=np.array([7, 9], np.int64),
+    probabilities=np.array([0.5, 1.0]),
+    table_size=2,
+    records=np.zeros((2, 5, 4), np.uint8),
+    actions=np.array([0, 2], np.uint8),
+    rewards=np.array([1.0, -5.0], np.float32),
+    discounts=np.array([0.9, 0.0], np.float32),
+    bootstrap_offsets=np.array([1, 1], np.uint8),
+    weights_versions=np.array([3, 3], np.int64),
+)
+PRIORITIES = Priorities(np.array([7, 9], np.int64), np.array([0.5, 0.0], np.float32))
 STATS = Stats("actor", "actor-0", {"env_steps": 3.0})
 EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
 _DEEP = b"\x91" * 1000 + b"\x90"  # a list in a list in a list …, as deep as msgpack unpacks
@@ -197,6 +224,10 @@ def changed(message: Any, **fields: Any) -> bytes:
 
 def floats(*values: float) -> list[Any]:
     return [[len(values)], np.array(values, "<f4").tobytes()]
+
+
+def doubles(*values: float) -> list[Any]:
+    return [[len(values)], np.array(values, "<f8").tobytes()]
 
 
 def octets(*values: int) -> list[Any]:
@@ -264,6 +295,26 @@ MALFORMED = {
     "one priority of two": (Chunk, changed(CHUNK, priorities=floats(1)), "priorities has neither"),
     "offset 0": (Chunk, changed(CHUNK, bootstrap_offsets=octets(1, 0)), "offset is 0"),
     "negative sequence": (Chunk, changed(CHUNK, sequence=-1), "is negative"),
+    "probability 0": (Samples, changed(SAMPLES, probabilities=doubles(0.5, 0)), "not above 0"),
+    "probability 2": (Samples, changed(SAMPLES, probabilities=doubles(0.5, 2)), "at most 1"),
+    "NaN probability": (Samples, changed(SAMPLES, probabilities=doubles(1, np.nan)), "not above"),
+    "a key too many": (Priorities, changed(PRIORITIES, priorities=floats(1)), "of one length"),
+    "keys a matrix": (
+        Priorities,
+        changed(PRIORITIES, keys=[[2, 1], b"a" * 16]),
+        "no vectors",
+    ),
+    "negative new priority": (
+        Priorities,
+        changed(PRIORITIES, priorities=floats(1, -1)),
+        "priority is negative",
+    ),
+    "infinite priority": (
+        Priorities,
+        changed(PRIORITIES, priorities=floats(1, np.inf)),
+        "not finite",
+    ),
+    "NaN priority": (Priorities, changed(PRIORITIES, priorities=floats(np.nan, 1)), "not finite"),
 }
 
 

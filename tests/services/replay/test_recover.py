@@ -67,7 +67,7 @@ def chunk(sequence: int, length: int = 16, *, actor: str = "a", n_step: int = 3)
 def start(directory: Path, config: Config = CONFIG) -> ReplayService:
     table, limiter = build(config)
     log = open_log(config, directory)
-    service = ReplayService(config, table, limiter, NoServer(), NoServer(), log)
+    service = ReplayService(config, table, limiter, *[NoServer()] * 3, log)
     service.recover()
     return service
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from common.config import Config, ReplayConfig, TransportConfig
-from common.trajectory import Chunk, InsertReply, Samples, Stats
+from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples, Stats
 from common.wire import SampleRequest, decode, encode
 from services.replay.limiter import RateLimiter
-from services.replay.sampler import UniformSampler
+from services.replay.sampler import PrioritizedSampler, UniformSampler
 from services.replay.service import ReplayService
 from services.replay.table import Table
 
@@ -80,18 +80,23 @@ class FakeServer:
 
 @dataclass
 class Replay:
-    """A service that is up, and the two ways to it."""
+    """A service that is up, and the three ways to it."""
 
     service: ReplayService
     table: Table
     inserts: FakeServer
     samples: FakeServer
+    priorities: FakeServer
 
     def insert(self, payload: bytes) -> tuple[str, bytes | str]:
         return self.inserts.ask(payload).answer()
 
     def sample(self, batch_size: int = BATCH) -> tuple[str, bytes | str]:
         return self.samples.ask(encode(SampleRequest(batch_size))).answer()
+
+    def prioritize(self, keys: list[int], priorities: list[float]) -> tuple[str, bytes | str]:
+        message = Priorities(np.array(keys, np.int64), np.array(priorities, np.float32))
+        return self.priorities.ask(encode(message)).answer()
 
     def fill(self, count: int) -> None:
         for sequence in range(count):
@@ -101,19 +106,26 @@ class Replay:
 
 @contextmanager
 def replay(
-    *, min_size: int = 10, ratio: float = 0.0, buffer: float = 0.0, hold_s: float = _DEADLINE_S
+    *,
+    min_size: int = 10,
+    ratio: float = 0.0,
+    buffer: float = 0.0,
+    hold_s: float = _DEADLINE_S,
+    prioritized: bool = False,
 ) -> Iterator[Replay]:
     config = Config(
         replay=ReplayConfig(capacity=1000, min_size=100, hold_s=hold_s),
         transport=TransportConfig(timeout_s=2 * hold_s),
     )
-    table = Table(1000, 2, 1, LENGTH, 4, UniformSampler(np.random.default_rng(0)))
+    rng = np.random.default_rng(0)
+    sampler = PrioritizedSampler(1000, 1.0, rng) if prioritized else UniformSampler(rng)
+    table = Table(1000, 2, 1, LENGTH, 4, sampler)
     limiter = RateLimiter(ratio, min_size, buffer, LENGTH, BATCH)
-    inserts, samples = FakeServer(), FakeServer()
-    service = ReplayService(config, table, limiter, inserts, samples)
+    inserts, samples, priorities = FakeServer(), FakeServer(), FakeServer()
+    service = ReplayService(config, table, limiter, inserts, samples, priorities)
     service.start()
     try:
-        yield Replay(service, table, inserts, samples)
+        yield Replay(service, table, inserts, samples, priorities)
     finally:
         service.stop()
 
@@ -221,6 +233,38 @@ def test_samples_are_the_tables_transitions() -> None:
         assert up.service.metrics()["samples"] == BATCH
 
 
+def test_priorities_decide_what_is_sampled_and_evicted_keys_are_ignored() -> None:
+    with replay(min_size=10, prioritized=True) as up:
+        up.fill(2)
+        kind, payload = up.prioritize([7, -1, 10, *range(10)], [9.0, 1.0, 1.0, *[0.0] * 10])
+        assert kind == "reply"
+        assert isinstance(payload, bytes)
+        assert decode(PrioritiesReply, payload) == PrioritiesReply(updated=11, ignored=2)
+        assert up.prioritize([7], [1000.0])[0] == "reply"
+        samples = up.table.sample(1000)
+        assert samples.keys.tolist().count(7) >= 999
+        metrics = up.service.metrics()
+        assert (metrics["priority_updates"], metrics["priorities_ignored"]) == (12, 2)
+
+
+def test_a_uniform_table_ignores_priorities() -> None:
+    with replay(min_size=10) as up:
+        up.fill(2)
+        _, payload = up.prioritize([7], [9.0])
+        assert isinstance(payload, bytes)
+        assert decode(PrioritiesReply, payload) == PrioritiesReply(updated=0, ignored=1)
+        assert up.service.metrics()["priorities_ignored"] == 1
+
+
+def test_priorities_that_cannot_be_are_refused_and_counted() -> None:
+    with replay(prioritized=True) as up:
+        up.fill(2)
+        assert up.prioritize([7], [-1.0]) == ("refuse", "a priority is negative or not finite")
+        metrics = up.service.metrics()
+        assert (metrics["refused"], metrics["priority_updates"]) == (1, 0)
+        assert up.service.healthy
+
+
 def test_a_sample_waits_for_min_size() -> None:
     with replay(min_size=10) as up:
         waiting = up.samples.ask(encode(SampleRequest(BATCH)))
@@ -290,7 +334,9 @@ def test_stop_answers_what_is_held_and_ends_the_threads() -> None:
         assert not up.service.healthy
         if held.answers.qsize():
             assert held.answer()[0] == "hold"
-    assert not {"insert", "sample"} & {thread.name for thread in threading.enumerate()}
+    assert not {"insert", "sample", "priorities"} & {
+        thread.name for thread in threading.enumerate()
+    }
 
 
 def test_metrics_name_the_table_and_the_limiter() -> None:
