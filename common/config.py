@@ -190,6 +190,13 @@ class ReplayConfig(Section):
     absolute TD error, to the power priority_exponent. (paper; Ape-X: prioritized)"""
     priority_exponent: Fraction = 0.6
     """alpha of prioritized sampling; 0 is uniform. (Ape-X)"""
+    importance_exponent: Fraction = 0.4
+    """beta of the importance weights, which take back what prioritized sampling distorts, in the
+    learner's first step; 1 takes back all of it. (Ape-X)"""
+    importance_exponent_final: Fraction = 0.4
+    """beta after importance_anneal_steps. (Ape-X; prioritized replay's paper: 1)"""
+    importance_anneal_steps: Count = 100_000
+    """Learner steps over which beta goes from the one to the other, linearly. (ours)"""
     samples_per_insert: Annotated[float, Field(ge=0)] = 8.0
     """Transitions sampled for each inserted; both sides are held to it; 0: no limit. (ours)"""
     tolerance: Annotated[float, Field(ge=0)] = 0.1

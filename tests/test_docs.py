@@ -254,7 +254,7 @@ def published(role: str) -> set[str]:
         config = Config()
         return set(ReplayService(config, *build(config), *[MagicMock()] * 3).metrics())
     if role == "learner":
-        meter = Meter(MagicMock(), MagicMock(), MagicMock())
+        meter = Meter(MagicMock(), MagicMock(), None, MagicMock())
         meter.last = MagicMock()
         return set(meter.metrics())
     return literal_keys(next(path for path, of in METRICS_OF.items() if of == role))

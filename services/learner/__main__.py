@@ -20,12 +20,13 @@ from common.process import (
 from common.trajectory import Samples
 from common.transport import Session
 from common.weights import WeightsWriter
-from services.learner.batch import Batch, collate
+from services.learner.batch import Batch, collate, importance_exponent_at
 from services.learner.keeper import Keeper
 from services.learner.learner import Learner
 from services.learner.meter import Meter
 from services.learner.prefetch import Prefetcher
-from services.replay.client import ReplayReader
+from services.learner.priorities import PrioritiesSender
+from services.replay.client import PriorityWriter, ReplayReader
 
 _LOG = logging.getLogger("learner")
 _POLL_S = 0.2
@@ -50,6 +51,9 @@ def main(argv: Sequence[str]) -> int:
         prefetcher = Prefetcher(
             reader, make_collate(config, learner), settings.prefetch_batches, stop
         )
+        priorities = None
+        if config.replay.prioritized:
+            priorities = PrioritiesSender(PriorityWriter(bulk, keys), settings.prefetch_batches)
         writer = WeightsWriter(session, keys)
         reporter = StatsReporter(
             session.publisher(keys.stats("learner", worker)), "learner", worker
@@ -57,10 +61,12 @@ def main(argv: Sequence[str]) -> int:
         session.announce(keys.live("learner", worker))
         _LOG.info("%s, %d threads", learner, torch.get_num_threads())
         try:
-            run(config, learner, prefetcher, writer, keeper, reporter, stop)
+            run(config, learner, prefetcher, priorities, writer, keeper, reporter, stop)
         finally:
             stop.set()
             prefetcher.close()
+            if priorities is not None:
+                priorities.close()
             writer.close()
     return 0
 
@@ -69,19 +75,25 @@ def run(
     config: Config,
     learner: Learner,
     prefetcher: Prefetcher,
+    priorities: PrioritiesSender | None,
     writer: WeightsWriter,
     keeper: Keeper,
     reporter: StatsReporter,
     stop: StopSignal,
 ) -> None:
-    """Learn until stopped or run.learner_steps is reached; leaves a last checkpoint."""
-    meter = Meter(learner, prefetcher, keeper)
+    """Learn until stopped or run.learner_steps is reached; leaves a last checkpoint.
+
+    priorities: where TD errors go; None where sampling is uniform.
+    """
+    meter = Meter(learner, prefetcher, priorities, keeper)
     writer.publish(keeper.next_weights())
     limit = config.run.learner_steps
     while not stop.is_set() and (not limit or learner.learner_step < limit):
         batch = meter.timed("data_wait", lambda: prefetcher.next(_POLL_S))
         if batch is not None:
-            meter.last = meter.timed("step", partial(learner.step, batch))
+            meter.last = update = meter.timed("step", partial(learner.step, batch))
+            if priorities is not None:
+                priorities.put(batch.keys, update.td_errors)
             if learner.learner_step % config.learner.publish_period == 0:
                 meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
             meter.timed("checkpoint", keeper.maybe_save)
@@ -95,14 +107,20 @@ def run(
 def make_collate(config: Config, learner: Learner) -> Callable[[Samples], Batch]:
     """From samples to the batch of one step, pictures drawn."""
     symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
-    return partial(
-        collate,
-        decode=make_codec(config.arena).decode,
-        stack=config.arena.stack,
-        symmetries=symmetries,
-        rng=learner.rng,
-        device=learner.device,
-    )
+    codec = make_codec(config.arena)
+
+    def collate_now(samples: Samples) -> Batch:
+        return collate(
+            samples,
+            codec.decode,
+            config.arena.stack,
+            symmetries=symmetries,
+            rng=learner.rng,
+            beta=importance_exponent_at(config.replay, learner.learner_step),
+            device=learner.device,
+        )
+
+    return collate_now
 
 
 if __name__ == "__main__":

@@ -14,8 +14,10 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from common.config import ReplayConfig
 from common.errors import WireError
-from common.trajectory import NUM_ACTIONS, Float32Array, Samples, UInt8Array
+from common.schedule import value_at
+from common.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples, UInt8Array
 
 
 class Symmetry(Protocol):
@@ -40,6 +42,14 @@ class Batch:
     discount: torch.Tensor  # float32 [B], gamma**k, 0 after a termination
     next_observation: torch.Tensor  # uint8 [B, S, V, V], k steps later
     importance_weights: torch.Tensor  # float32 [B], largest is 1
+    keys: Int64Array  # [B], of the transitions in replay
+
+
+def importance_exponent_at(replay: ReplayConfig, learner_step: int) -> float:
+    """beta of the importance weights at a learner step: linear, then constant."""
+    begin = (0, replay.importance_exponent)
+    end = (replay.importance_anneal_steps, replay.importance_exponent_final)
+    return value_at((begin, end), learner_step)
 
 
 def importance_weights(samples: Samples, beta: float) -> Float32Array:
@@ -87,6 +97,7 @@ def collate(
         discount=torch.from_numpy(samples.discounts.astype(np.float32)).to(device),
         next_observation=on_device[rows, window],
         importance_weights=torch.from_numpy(importance_weights(samples, beta)).to(device),
+        keys=samples.keys,
     )
 
 

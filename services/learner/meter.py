@@ -7,6 +7,7 @@ from typing import TypeVar
 from services.learner.keeper import Keeper
 from services.learner.learner import Learner, Update
 from services.learner.prefetch import Prefetcher
+from services.learner.priorities import PrioritiesSender
 
 T = TypeVar("T")
 
@@ -14,9 +15,16 @@ T = TypeVar("T")
 class Meter:
     """Times the stages of the learner's loop."""
 
-    def __init__(self, learner: Learner, prefetcher: Prefetcher, keeper: Keeper) -> None:
+    def __init__(
+        self,
+        learner: Learner,
+        prefetcher: Prefetcher,
+        priorities: PrioritiesSender | None,
+        keeper: Keeper,
+    ) -> None:
         self._learner = learner
         self._prefetcher = prefetcher
+        self._priorities = priorities
         self._keeper = keeper
         self._seconds = dict.fromkeys(("data_wait", "step", "publish", "checkpoint"), 0.0)
         self._started_s = time.perf_counter()
@@ -38,6 +46,7 @@ class Meter:
             "weights_epoch": self._keeper.epoch,
             "batches_ready": self._prefetcher.ready,
             "batches_refused": self._prefetcher.refused,
+            "priorities_dropped": self._priorities.dropped if self._priorities else 0,
             "decode_share": self._prefetcher.decode_s / lived_s,
         }
         metrics |= {f"{stage}_share": s / lived_s for stage, s in self._seconds.items()}

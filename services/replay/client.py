@@ -7,7 +7,7 @@ from collections import deque
 from common.errors import DeadlineError, HeldError, WireError
 from common.keys import Keys
 from common.process import StopSignal
-from common.trajectory import Chunk, InsertReply, Samples
+from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples
 from common.transport import PendingReply, Session
 from common.wire import SampleRequest, decode, encode
 
@@ -80,6 +80,23 @@ class ReplayReader:
             else:
                 return samples
         return None
+
+
+class PriorityWriter:
+    """Sets priorities; each is tried once, since a lost one does no harm."""
+
+    def __init__(self, session: Session, keys: Keys) -> None:
+        self._client = session.client(keys.priorities(), "replay")
+
+    def update(self, priorities: Priorities) -> PrioritiesReply | None:
+        """The acknowledgement; None where replay is away or busy.
+
+        Raises RefusedError, with replay's reason, when the message is wrong.
+        """
+        try:
+            return decode(PrioritiesReply, self._client.ask(encode(priorities)).result())
+        except (HeldError, DeadlineError, WireError):
+            return None
 
 
 class _Patience:

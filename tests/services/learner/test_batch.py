@@ -6,9 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.config import ReplayConfig
 from common.errors import WireError
 from common.trajectory import Samples, UInt8Array
-from services.learner.batch import collate, importance_weights
+from services.learner.batch import collate, importance_exponent_at, importance_weights
 
 VIEW_PX = 5
 
@@ -59,6 +60,7 @@ def test_states_are_the_windows_the_offsets_name() -> None:
     torch.testing.assert_close(batch.discount, torch.from_numpy(samples.discounts))
     assert batch.action.tolist() == samples.actions.tolist()
     assert batch.importance_weights.tolist() == [1.0, 1.0, 1.0]
+    assert batch.keys.tolist() == samples.keys.tolist()
 
 
 def test_dtypes_and_shapes() -> None:
@@ -171,3 +173,20 @@ def test_importance_weights_by_hand() -> None:
     np.testing.assert_allclose(importance_weights(samples, 0.5), [1.0, 0.5])
     np.testing.assert_allclose(importance_weights(samples, 1.0), [1.0, 0.25])
     np.testing.assert_allclose(importance_weights(samples, 0.0), [1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("step", "expected"), [(0, 0.4), (50, 0.55), (200, 1.0), (201, 1.0), (10**9, 1.0)]
+)
+def test_importance_exponent_is_annealed(step: int, expected: float) -> None:
+    annealed = ReplayConfig(
+        importance_exponent=0.4, importance_exponent_final=1.0, importance_anneal_steps=200
+    )
+    assert importance_exponent_at(annealed, step) == pytest.approx(expected)
+    assert importance_exponent_at(ReplayConfig(), step) == 0.4
+
+
+def test_of_equal_probabilities_all_weights_are_exactly_1() -> None:
+    samples = make_samples([1] * 7, width=5)
+    samples.probabilities[:] = 1 / 93
+    assert (importance_weights(samples, 0.4) == 1.0).all()

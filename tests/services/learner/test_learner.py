@@ -44,6 +44,7 @@ def random_batch(size: int = 8, seed: int = 0) -> Batch:
         discount=torch.full((size,), 0.99),
         next_observation=pictures[1],
         importance_weights=torch.ones(size),
+        keys=np.arange(size),
     )
 
 
@@ -85,6 +86,7 @@ def walk() -> tuple[Batch, Float32Array]:
         discount=torch.where(ends, 0.0, GAMMA),
         next_observation=pictures[following],
         importance_weights=torch.ones(len(places)),
+        keys=np.arange(len(places)),
     )
     optimal = torch.zeros((PLACES, 3))
     for _ in range(200):

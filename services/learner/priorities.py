@@ -1,0 +1,75 @@
+"""TD errors on their way back to replay, sent by a thread of its own while the learner computes.
+
+Invariants: the learner never waits for it, not even for the device: `put` takes tensors, and the
+thread reads them; one message is under way at a time; at most `capacity` batches wait, the oldest
+are dropped and counted (harmless: the next draw of a transition brings a newer error).
+"""
+
+import threading
+from collections import deque
+
+import numpy as np
+import torch
+
+from common.trajectory import Int64Array, Priorities
+from services.replay.client import PriorityWriter
+
+
+class PrioritiesSender:
+    """Sends absolute TD errors; batches that wait are put together into one message."""
+
+    def __init__(self, writer: PriorityWriter, capacity: int) -> None:
+        self._writer = writer
+        self._waiting: deque[tuple[Int64Array, torch.Tensor]] = deque()
+        self._capacity = capacity
+        self._changed = threading.Condition()
+        self._closing = False
+        self._error: Exception | None = None
+        self.dropped = 0
+        """Batches whose errors never reached replay."""
+        self._thread = threading.Thread(target=self._run, name="priorities")
+        self._thread.start()
+
+    def put(self, keys: Int64Array, td_errors: torch.Tensor) -> None:
+        """TD errors float32 [B], on any device, of the transitions keys int64 [B].
+
+        Raises the error that ended the sending: replay refused, and why.
+        """
+        if self._error is not None:
+            raise self._error
+        with self._changed:
+            if len(self._waiting) == self._capacity:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append((keys, td_errors))
+            self._changed.notify()
+
+    def close(self) -> None:
+        """End the thread after the message under way; what waits is dropped."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (batches := self._take()) is not None:
+            try:
+                errors = [td_errors.abs().cpu().numpy() for _, td_errors in batches]
+                keys = np.concatenate([keys for keys, _ in batches])
+                reply = self._writer.update(Priorities(keys, np.concatenate(errors)))
+            except Exception as error:  # noqa: BLE001  raised again by put, in the owner's thread
+                self._error = error
+                return
+            if reply is None:
+                with self._changed:
+                    self.dropped += len(batches)
+
+    def _take(self) -> list[tuple[Int64Array, torch.Tensor]] | None:
+        """All that waits, once there is something; None when closing."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._waiting)
+            if self._closing:
+                return None
+            batches = list(self._waiting)
+            self._waiting.clear()
+            return batches
