@@ -25,6 +25,11 @@ class Selection:
     q_values: Float32Array  # [N, num_actions]
     greedy_q: Float32Array  # [N], of the best action, whether it was taken or not
 
+    @property
+    def taken_q(self) -> Float32Array:
+        """Values of the chosen actions, [N]."""
+        return self.q_values[np.arange(len(self.actions)), self.actions]
+
 
 class Policy:
     """Epsilon-greedy on a network's values (paper section 5.2)."""

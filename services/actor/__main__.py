@@ -161,6 +161,8 @@ def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
         n_step=config.agent.n_step,
         stack=config.arena.stack,
         chunk_length=config.actor.chunk_length,
+        prioritized=config.replay.prioritized,
+        reward_scale=config.agent.reward_scale,
     )
     codec = make_codec(config.arena)
     return Collector(config, origin, arenas, codec, policy, np.random.default_rng(policy_seed))

@@ -5,10 +5,15 @@ returns are summed here and nowhere else; pure.
 
     R_t = sum_{i<k} gamma^i r_{t+i},   discount_t = gamma^k, or 0 if the episode terminated there,
     k = min(n, steps left in the episode)
+
+Initial priorities are the TD errors of the values the actions were chosen by (Ape-X, section 3):
+
+    p_t = |scale R_t + discount_t max_a Q(s_{t+k}, a) - Q(s_t, a_t)|
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +22,11 @@ from common.trajectory import Chunk, Float32Array, UInt8Array
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Who makes the chunks, and how they are cut."""
+    """Who makes the chunks, and how they are cut.
+
+    prioritized: whether chunks bear priorities; they are then cut one step later, when the value
+    of their last bootstrap is known. reward_scale: of the TD errors, as in the learner.
+    """
 
     actor: str
     incarnation: int
@@ -25,6 +34,8 @@ class Origin:
     n_step: int
     stack: int
     chunk_length: int
+    prioritized: bool = False
+    reward_scale: float = 1.0
 
 
 class Chunker:
@@ -37,11 +48,19 @@ class Chunker:
         self._actions: list[int] = []
         self._rewards: list[float] = []
         self._versions: list[int] = []
+        self._taken_q: list[float] = []
+        self._greedy_q: list[float] = []
 
     def start(self, record: UInt8Array) -> None:
         """Begin an episode with its first record, uint8 [R], repeated to fill the first state."""
         self._records = [record] * self._origin.stack
-        self._actions, self._rewards, self._versions = [], [], []
+        for column in self._columns:
+            column.clear()
+
+    @property
+    def _columns(self) -> tuple[list[Any], ...]:
+        """What there is one of for each step."""
+        return (self._actions, self._rewards, self._versions, self._taken_q, self._greedy_q)
 
     def add(
         self,
@@ -49,6 +68,8 @@ class Chunker:
         reward: float,
         record: UInt8Array,
         *,
+        taken_q: float,
+        greedy_q: float,
         weights_version: int,
         last: bool,
         discount: float,
@@ -56,16 +77,19 @@ class Chunker:
     ) -> list[Chunk]:
         """One step: the action, its reward and the record after it; the chunks now complete.
 
-        discount: of the step, 0 where the episode terminated. sequence: the actor's next numbers.
+        taken_q, greedy_q: values of the action and of the best one, in the state before. discount:
+        of the step, 0 where the episode terminated. sequence: the actor's next numbers.
         """
         self._records.append(record)
         self._actions.append(action)
         self._rewards.append(reward)
         self._versions.append(weights_version)
+        self._taken_q.append(taken_q)
+        self._greedy_q.append(greedy_q)
         if last:
             return self._finish(discount, sequence)
         length, n = self._origin.chunk_length, self._origin.n_step
-        if len(self._actions) < length + n - 1:
+        if len(self._actions) < length + n - 1 + self._origin.prioritized:
             return []
         return [self._cut(length, discount=1.0, sequence=sequence)]
 
@@ -92,9 +116,9 @@ class Chunker:
             rewards=rewards,
             discounts=discounts,
             bootstrap_offsets=offsets,
-            priorities=np.empty(0, np.float32),
+            priorities=self._priorities(rewards, discounts, offsets),
         )
-        for column in (self._records, self._actions, self._rewards, self._versions):
+        for column in (self._records, *self._columns):
             del column[:length]
         return chunk
 
@@ -119,3 +143,21 @@ class Chunker:
             discounts.astype(np.float32),
             offsets.astype(np.uint8),
         )
+
+    def _priorities(
+        self, rewards: Float32Array, discounts: Float32Array, offsets: UInt8Array
+    ) -> Float32Array:
+        """Absolute TD errors of the first transitions, [len(rewards)], or [0] if none are due.
+
+        Nobody acts in an episode's last state, so its value is not known; where the episode was
+        truncated, and only there it counts, the value of the state before stands for it.
+        """
+        if not self._origin.prioritized:
+            return np.empty(0, np.float32)
+        length = len(rewards)
+        bootstraps = np.minimum(np.arange(length) + offsets, len(self._greedy_q) - 1)
+        taken_q = np.array(self._taken_q[:length], np.float32)
+        next_q = np.array(self._greedy_q, np.float32)[bootstraps]
+        errors = np.float32(self._origin.reward_scale) * rewards + discounts * next_q - taken_q
+        priorities: Float32Array = np.abs(errors)
+        return priorities

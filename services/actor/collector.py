@@ -81,13 +81,17 @@ class Collector:
         actions = selection.actions.reshape(shape)
         time_steps = [arena.step(a) for arena, a in zip(self._arenas, actions, strict=True)]
         stepped = time.perf_counter()
+        taken_q = selection.taken_q.reshape(shape)
+        greedy_q = selection.greedy_q.reshape(shape)
         chunks = [
             chunk
             for index, time_step in enumerate(time_steps)
-            for chunk in self._add(index, actions[index], time_step)
+            for chunk in self._add(
+                index, actions[index], taken_q[index], greedy_q[index], time_step
+            )
         ]
-        greedy_q = selection.greedy_q.reshape(shape).mean(axis=1)
-        for episode, time_step, q in zip(self._episodes, time_steps, greedy_q, strict=True):
+        mean_q = greedy_q.mean(axis=1)
+        for episode, time_step, q in zip(self._episodes, time_steps, mean_q, strict=True):
             episode.frames += 1
             episode.rewards += float(time_step.rewards.mean())
             episode.collisions += int(time_step.collided.sum())
@@ -105,12 +109,21 @@ class Collector:
         self.seconds.draw += time.perf_counter() - chunked
         return chunks, summaries
 
-    def _add(self, index: int, actions: UInt8Array, time_step: TimeStep) -> Iterator[Chunk]:
+    def _add(
+        self,
+        index: int,
+        actions: UInt8Array,
+        taken_q: Float32Array,
+        greedy_q: Float32Array,
+        time_step: TimeStep,
+    ) -> Iterator[Chunk]:
         for robot, chunker in enumerate(self._chunkers[index]):
             yield from chunker.add(
                 int(actions[robot]),
                 float(time_step.rewards[robot]),
                 time_step.records[robot],
+                taken_q=float(taken_q[robot]),
+                greedy_q=float(greedy_q[robot]),
                 weights_version=max(self._policy.weights_version, 0),
                 last=time_step.last,
                 discount=time_step.discount,

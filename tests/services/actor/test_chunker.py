@@ -35,9 +35,15 @@ def run(
     gamma: float = 0.5,
     stack: int = STACK,
     versions: tuple[int, ...] = (),
+    values: tuple[tuple[float, float], ...] = (),
+    reward_scale: float = 1.0,
 ) -> list[Chunk]:
-    """The chunks of these episodes; action t is t % 3, counted on over all episodes."""
-    origin = Origin("a", 9, gamma, n_step, stack, chunk_length)
+    """The chunks of these episodes; action t is t % 3, counted on over all episodes.
+
+    values: of the action and of the best one in each state that was acted in; chunks bear
+    priorities if they are given.
+    """
+    origin = Origin("a", 9, gamma, n_step, stack, chunk_length, bool(values), reward_scale)
     chunker, sequence = Chunker(origin), iter(range(1000))
     steps = itertools.count()
     chunks: list[Chunk] = []
@@ -50,6 +56,8 @@ def run(
                 step % 3,
                 reward,
                 np.array([episode.record(index + 1)], np.uint8),
+                taken_q=values[step][0] if values else 0.0,
+                greedy_q=values[step][1] if values else 0.0,
                 weights_version=versions[step] if versions else 0,
                 last=last,
                 discount=episode.discount if last else 1.0,
@@ -147,6 +155,71 @@ def test_a_chunks_version_is_the_oldest_of_its_steps() -> None:
     assert [chunk.weights_version for chunk in chunks] == [3, 4, 9]
 
 
+# Of the action taken and of the best one, in five states.
+VALUES = ((1.0, 8.0), (2.0, 16.0), (3.0, 32.0), (4.0, 64.0), (5.0, 128.0))
+
+
+def test_one_step_priorities_by_hand() -> None:
+    """r + 0.5 max Q(s') - Q(s, a); nothing after a termination."""
+    episode = Episode(10, (1, 2, 4, 8, -6), 0.0)
+    (chunk,) = run([episode], n_step=1, chunk_length=8, values=VALUES)
+    assert chunk.priorities.tolist() == [
+        1 + 8 - 1,
+        2 + 16 - 2,
+        4 + 32 - 3,
+        8 + 64 - 4,
+        6 + 5,
+    ]
+    assert chunk.priorities.dtype == np.float32
+
+
+def test_three_step_priorities_by_hand() -> None:
+    """Returns 1 + 1 + 1, 2 + 2 + 2, 4 + 4 - 2, 8 - 4, -8; the first two have discount 1/8."""
+    episode = Episode(10, (1, 2, 4, 8, -8), 0.0)
+    (chunk,) = run([episode], n_step=3, chunk_length=8, values=VALUES)
+    assert chunk.rewards.tolist() == [3, 6, 6, 4, -8]
+    assert chunk.discounts.tolist() == [0.125, 0.125, 0, 0, 0]
+    assert chunk.priorities.tolist() == [
+        3 + 64 / 8 - 1,
+        6 + 128 / 8 - 2,
+        6 - 3,
+        0,
+        8 + 5,
+    ]
+
+
+def test_priorities_of_a_truncated_episode_take_the_state_before_its_last() -> None:
+    """The bootstraps of the last three transitions lie in the state that nobody acted in."""
+    (chunk,) = run([Episode(10, (0,) * 5, 1.0)], n_step=3, chunk_length=8, values=VALUES)
+    assert chunk.discounts.tolist() == [0.125, 0.125, 0.125, 0.25, 0.5]
+    assert chunk.priorities.tolist() == [
+        64 / 8 - 1,
+        128 / 8 - 2,
+        128 / 8 - 3,
+        128 / 4 - 4,
+        128 / 2 - 5,
+    ]
+
+
+def test_rewards_of_priorities_are_scaled_as_in_the_learner() -> None:
+    episode = Episode(10, (8, -16), 0.0)
+    (chunk,) = run([episode], n_step=1, chunk_length=8, values=VALUES[:2], reward_scale=0.25)
+    assert chunk.rewards.tolist() == [8, -16]
+    assert chunk.priorities.tolist() == [2 + 8 - 1, 4 + 2]
+
+
+def test_a_chunk_with_priorities_waits_for_the_value_of_its_last_bootstrap() -> None:
+    for n_step, steps in ((1, 3), (3, 5)):
+        zeros = ((0.0, 0.0),) * (steps - 1)
+        waiting = Episode(10, (0,) * (steps - 1), 1.0, ended=False)
+        assert run([waiting], n_step=n_step, chunk_length=2, values=zeros) == []
+        cut = Episode(10, (0,) * steps, 1.0, ended=False)
+        values = (*zeros, (0.0, 2.0**n_step))
+        (chunk,) = run([cut], n_step=n_step, chunk_length=2, values=values)
+        assert chunk.priorities.tolist() == [0, 1]
+        assert len(chunk.records) == STACK - 1 + 2 + n_step
+
+
 def naive_return(
     episode: Episode, step: int, n_step: int, gamma: float
 ) -> tuple[float, float, int]:
@@ -179,12 +252,21 @@ EPISODES = st.lists(
 )
 
 
-@given(EPISODES, st.integers(1, 5), st.integers(1, 12), st.integers(1, 4))
+@given(EPISODES, st.integers(1, 5), st.integers(1, 12), st.integers(1, 4), st.booleans())
 def test_every_step_is_in_one_transition_with_the_naive_returns_and_stacks(
-    episodes: list[Episode], n_step: int, chunk_length: int, stack: int
+    episodes: list[Episode], n_step: int, chunk_length: int, stack: int, prioritized: bool
 ) -> None:
     gamma = 0.9
-    chunks = run(episodes, n_step=n_step, chunk_length=chunk_length, gamma=gamma, stack=stack)
+    count = sum(len(episode.rewards) for episode in episodes)
+    values = tuple((float(3 * step % 7), float(5 * step % 11)) for step in range(count))
+    chunks = run(
+        episodes,
+        n_step=n_step,
+        chunk_length=chunk_length,
+        gamma=gamma,
+        stack=stack,
+        values=values if prioritized else (),
+    )
     assert [chunk.sequence for chunk in chunks] == list(range(len(chunks)))
     steps = [(e, t) for e in episodes for t in range(len(e.rewards))]
     transitions = [(chunk, t) for chunk in chunks for t in range(len(chunk))]
@@ -197,8 +279,13 @@ def test_every_step_is_in_one_transition_with_the_naive_returns_and_stacks(
         assert chunk.bootstrap_offsets[t] == offset
         assert window(chunk, t, stack) == naive_stack(episode, step, stack)
         assert window(chunk, t + offset, stack) == naive_stack(episode, step + offset, stack)
+        if prioritized:
+            ahead = min(step + offset, len(episode.rewards) - 1) - step
+            error = total + discount * values[number + ahead][1] - values[number][0]
+            assert chunk.priorities[t] == pytest.approx(abs(error), rel=1e-5, abs=1e-4)
     for chunk in chunks:
         assert len(chunk) <= chunk_length
+        assert len(chunk.priorities) == (len(chunk) if prioritized else 0)
         assert len(chunk.records) == stack - 1 + len(chunk) + n_step
         assert_dtypes(chunk.records, chunk.rewards, chunk.discounts)
 

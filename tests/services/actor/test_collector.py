@@ -77,9 +77,9 @@ def make_network() -> QNetwork:
         return QNetwork("dqn", view_px=VIEW_PX)
 
 
-def collect(steps: int) -> Collected:
+def collect(steps: int, *, prioritized: bool = False) -> Collected:
     policy = WatchedPolicy(Policy(make_network()))
-    origin = Origin("actor-0", 5, 0.99, N_STEP, STACK, chunk_length=7)
+    origin = Origin("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
     arenas = [CountingArena(CONFIG.arena, identity=index) for index in range(ARENAS)]
     collector = Collector(
         CONFIG,
@@ -218,3 +218,24 @@ def test_the_same_seeds_give_the_same_chunks(collected: Collected) -> None:
     for ours, theirs in zip(collect(20).chunks, collected.chunks, strict=False):
         np.testing.assert_array_equal(ours.records, theirs.records)
         np.testing.assert_array_equal(ours.actions, theirs.actions)
+
+
+def test_priorities_are_the_td_errors_of_the_values_acted_by(collected: Collected) -> None:
+    """Known from evaluating the sent states again; the weights adopted meanwhile are the same."""
+    network = Policy(make_network())
+    prioritized = collect(STEPS, prioritized=True).chunks
+    assert sum(map(len, prioritized)) > ROBOTS * ARENAS * (STEPS - 12)
+    for chunk in prioritized:
+        pictures = chunk.records.reshape(-1, VIEW_PX, VIEW_PX)
+        counters = decode_counters(pictures)
+        frames = counting_frames(int(counters.identity[0]), int(counters.episode[0]))
+        for t, offset in enumerate(chunk.bootstrap_offsets.tolist()):
+            now = network.q_values(pictures[np.newaxis, t : t + STACK])[0]
+            # nobody acted in an episode's last state: the one before stands for it
+            step = int(counters.step[t + STACK - 1])
+            ahead = min(offset, frames - 1 - step)
+            later = network.q_values(pictures[np.newaxis, t + ahead : t + ahead + STACK])[0]
+            target = 0.1 * chunk.rewards[t] + chunk.discounts[t] * later.max()
+            error = abs(target - now[chunk.actions[t]])
+            assert chunk.priorities[t] == pytest.approx(error, rel=1e-4, abs=1e-5)
+    assert {len(chunk.priorities) for chunk in collected.chunks} == {0}
