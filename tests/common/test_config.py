@@ -260,6 +260,32 @@ def test_the_preset_paper_is_the_paper(dotted: str) -> None:
     assert getattr(getattr(load("paper"), section), name) == PAPER[dotted]
 
 
+# Horgan et al. 2018, section 4.1.
+APEX = {
+    "agent.n_step": 3,
+    "agent.learning_rate": 6.25e-5,
+    "agent.target_period": 2500,
+    "exploration.kind": "ladder",
+    "exploration.schedule": ((0, 0.4),),
+    "replay.sampler": "prioritized",
+    "replay.priority_exponent": 0.6,
+    "replay.importance_exponent": 0.4,
+    "replay.importance_exponent_final": 0.4,
+    "learner.batch_size": 512,
+}
+
+
+@pytest.mark.parametrize("dotted", APEX)
+def test_the_preset_apex_is_ape_x(dotted: str) -> None:
+    section, name = dotted.split(".")
+    assert getattr(getattr(load("apex"), section), name) == APEX[dotted]
+
+
+@pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
+def test_the_other_presets_sample_uniformly(preset: str) -> None:
+    assert not load(preset).replay.prioritized
+
+
 def test_the_length_of_a_record_follows_from_the_codec() -> None:
     assert load(None, {"arena.codec": "frames"}).arena.record_bytes == 3600
     assert load(None, {"arena.num_robots": "4"}).arena.record_bytes == 80
