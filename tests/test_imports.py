@@ -23,6 +23,7 @@ PLACES = {
     "pymunk": ("common/arena",),
     "cv2": ("common/arena",),
     "numba": ("common/arena",),
+    "scipy": ("common/arena/controllers",),
     "pydantic": ("common/config.py",),
     "torch": (
         "common/network.py",

@@ -5,7 +5,6 @@ Invariants: the only package that imports pymunk or OpenCV; it knows of no netwo
 
 from common.arena.arena import Arena, make_arena
 from common.arena.codec import FrameCodec, ObservationCodec, SceneCodec, make_codec
-from common.arena.controllers import Controller, controller, greedy_actions, random_actions
 from common.arena.counting import (
     Counters,
     CountingArena,
@@ -30,7 +29,6 @@ __all__ = [
     "STRAIGHT",
     "AnalyticViews",
     "Arena",
-    "Controller",
     "Counters",
     "CountingArena",
     "FrameCodec",
@@ -40,7 +38,6 @@ __all__ = [
     "Start",
     "Symmetry",
     "World",
-    "controller",
     "counting_frames",
     "counting_outcome",
     "counting_reward",
@@ -48,13 +45,11 @@ __all__ = [
     "draw_arena",
     "fixed_layout",
     "frame_rewards",
-    "greedy_actions",
     "layout_for",
     "layout_symmetries",
     "literal_views",
     "make_arena",
     "make_codec",
-    "random_actions",
     "target_distances_px",
     "test_starts",
     "training_start",

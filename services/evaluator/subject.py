@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from common.arena import controller, make_codec
+from common.arena import make_codec
+from common.arena.controllers import CONTROLLERS, check_controller, controller
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, load_config
 from common.errors import CheckpointError, ConfigError
@@ -39,15 +40,15 @@ class Subject:
         epsilon = self.config.evaluator.epsilon
         if self.policy is not None:
             return PolicyPlayer(arena, make_codec(arena), self.policy, epsilon, rng)
-        chosen = controller(self.controller or "", arena, rng)
-        return ControllerPlayer(chosen, epsilon, rng)
+        name = self.controller or ""
+        return ControllerPlayer(lambda: controller(name, arena, rng), epsilon, rng)
 
 
 def subject_parser(command: str, description: str) -> Parser:
     """The flags that name a subject."""
     parser = Parser(prog=f"mrcdrl {command}", description=description)
     parser.add_argument("weights", nargs="?", type=Path, help="a .safetensors file, or a run")
-    parser.add_argument("--controller", help="random or greedy, instead of weights")
+    parser.add_argument("--controller", help=f"instead of weights: {', '.join(CONTROLLERS)}")
     parser.add_argument("--robots", metavar="K", help="arena.num_robots")
     parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
     add_config_flags(parser)
@@ -57,8 +58,8 @@ def subject_parser(command: str, description: str) -> Parser:
 def subject(arguments: argparse.Namespace) -> Subject:
     """What the flags name.
 
-    Raises ConfigError for flags that contradict each other, CheckpointError for weights that
-    cannot be read, are foreign, or do not fit the arena.
+    Raises ConfigError for flags that contradict each other and for an unknown controller,
+    CheckpointError for weights that cannot be read, are foreign, or do not fit the arena.
     """
     if (arguments.weights is None) == (arguments.controller is None):
         raise ConfigError("give either weights or --controller")
@@ -67,7 +68,7 @@ def subject(arguments: argparse.Namespace) -> Subject:
         given["arena.num_robots"] = arguments.robots
     if arguments.controller is not None:
         config = load_config(arguments.config or "quick", given)
-        return Subject(config, None, arguments.controller, Weights(0, 0, 0, b""))
+        return Subject(config, None, check_controller(arguments.controller), Weights(0, 0, 0, b""))
     path = weights_path(arguments.weights)
     config = load_config(arguments.config or _config_beside(path), given)
     payload, manifest = _read(path)

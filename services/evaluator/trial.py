@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.arena import Arena, ObservationCodec, Scene, Start
+from common.arena.controllers import Controller
 from common.config import ArenaConfig
 from common.policy import FrameStack, Policy
 from common.trajectory import NUM_ACTIONS, Float64Array, Outcome, TimeStep, UInt8Array
@@ -85,23 +86,26 @@ class PolicyPlayer:
 
 
 class ControllerPlayer:
-    """Plays by a controller that sees the true state; explores like the policy does."""
+    """Plays by controllers that see the true state; explores like the policy does."""
 
     def __init__(
         self,
-        controller: Callable[[Scene], UInt8Array],
+        make_controller: Callable[[], Controller],
         epsilon: float,
         rng: np.random.Generator,
     ) -> None:
-        self._controller = controller
+        """make_controller: called for every episode, as a controller plays one."""
+        self._make_controller = make_controller
+        self._controllers: dict[int, Controller] = {}
         self._epsilon = epsilon
         self._rng = rng
 
     def begin(self, arena: int, time_step: TimeStep) -> None:
-        """Nothing to remember."""
+        self._controllers[arena] = self._make_controller()
 
     def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
-        actions = np.stack([self._controller(scene) for scene in scenes])
+        pairs = zip(arenas.tolist(), scenes, strict=True)
+        actions = np.stack([self._controllers[arena](scene) for arena, scene in pairs])
         explores = self._rng.random(actions.shape) < self._epsilon
         uniform = self._rng.integers(NUM_ACTIONS, size=actions.shape, dtype=np.uint8)
         return np.where(explores, uniform, actions)

@@ -10,14 +10,12 @@ import pytest
 from common.arena import (
     Arena,
     CountingArena,
-    Scene,
     Start,
-    controller,
-    greedy_actions,
     make_arena,
     make_codec,
     starts,
 )
+from common.arena.controllers import controller
 from common.config import ArenaConfig
 from common.errors import ConfigError
 from common.trajectory import Outcome, StepType
@@ -165,24 +163,3 @@ def test_a_seed_gives_the_same_play_in_another_process() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert other.stdout.strip() == fingerprint()
-
-
-def test_greedy_goes_to_free_targets_and_mostly_succeeds() -> None:
-    config = ArenaConfig()
-    robots = np.array([[170.0, 100, 0], [180.0, 500, 0]])
-    nearer = greedy_actions(Scene(robots, TARGETS), config)
-    assert nearer.tolist() == [2, 0]  # one to (175, 300), below it; one to (425, 300), above
-    game = Arena(config, np.random.default_rng(0), max_collisions=1)
-    play = controller("greedy", config, np.random.default_rng(0))
-    outcomes = []
-    for begin in starts.test_starts(config, 40, seed=0):
-        step = game.reset(begin)
-        while not step.last:
-            step = game.step(play(game.scene))
-        outcomes.append(step.outcome)
-    assert outcomes.count(Outcome.SUCCESS) >= 30
-
-
-def test_an_unknown_controller_is_refused() -> None:
-    with pytest.raises(ConfigError, match="'clever'"):
-        controller("clever", ArenaConfig(), np.random.default_rng(0))

@@ -33,8 +33,8 @@ def test_a_controller_plays_in_the_preset_quick() -> None:
 
 
 def test_an_unknown_controller_is_refused() -> None:
-    with pytest.raises(ConfigError, match="there are random and greedy"):
-        named("--controller", "clever").player(0)
+    with pytest.raises(ConfigError, match="'greed'; did you mean greedy"):
+        named("--controller", "greed")
 
 
 @pytest.mark.parametrize("argv", [(), ("weights.safetensors", "--controller", "greedy")])

@@ -12,11 +12,11 @@ from common.arena import (
     STRAIGHT,
     Scene,
     Start,
-    controller,
     layout_for,
     make_codec,
     test_starts,
 )
+from common.arena.controllers import controller
 from common.config import ArenaConfig
 from common.network import QNetwork
 from common.policy import Policy
@@ -50,7 +50,7 @@ class SteadyPlayer:
 
 def controlled(name: str, epsilon: float = 0.0, seed: int = 0) -> ControllerPlayer:
     rng = np.random.default_rng(seed)
-    return ControllerPlayer(controller(name, CONFIG, rng), epsilon, rng)
+    return ControllerPlayer(lambda: controller(name, CONFIG, rng), epsilon, rng)
 
 
 def by_policy(epsilon: float) -> PolicyPlayer:

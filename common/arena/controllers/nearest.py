@@ -1,19 +1,15 @@
-"""Players that see the true state: to exercise the arena and to compare learned ones with.
+"""The simplest players: by chance, and each robot straight to the nearest free target.
 
 Invariants: pure functions of the scene and the injected generator.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
+from common.arena.controllers.heading import actions_towards, bearings_rad
 from common.arena.rewards import target_distances_px
-from common.arena.scene import STRAIGHT, Scene
+from common.arena.scene import Scene
 from common.config import ArenaConfig
-from common.errors import ConfigError
 from common.trajectory import NUM_ACTIONS, Int64Array, UInt8Array
-
-Controller = Callable[[Scene], UInt8Array]
 
 
 def random_actions(scene: Scene, rng: np.random.Generator) -> UInt8Array:
@@ -28,20 +24,7 @@ def greedy_actions(scene: Scene, config: ArenaConfig) -> UInt8Array:
     target that no nearer robot has taken, by the turn that leaves the least bearing.
     """
     aims = scene.targets[_free_targets(scene)] - scene.robots[:, :2]
-    bearings = np.arctan2(aims[:, 1], aims[:, 0]) - scene.robots[:, 2]
-    turns = (np.arange(NUM_ACTIONS) - STRAIGHT) * np.radians(config.turn_deg)
-    left_over = np.abs(np.angle(np.exp(1j * (bearings[:, None] - turns))))
-    actions: UInt8Array = left_over.argmin(axis=1).astype(np.uint8)
-    return actions
-
-
-def controller(name: str, config: ArenaConfig, rng: np.random.Generator) -> Controller:
-    """The controller called `random` or `greedy`; raises ConfigError for another name."""
-    if name == "random":
-        return lambda scene: random_actions(scene, rng)
-    if name == "greedy":
-        return lambda scene: greedy_actions(scene, config)
-    raise ConfigError(f"unknown controller {name!r}; there are random and greedy")
+    return actions_towards(scene.robots[:, 2], bearings_rad(aims), config)
 
 
 def _free_targets(scene: Scene) -> Int64Array:

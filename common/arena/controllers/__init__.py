@@ -1,0 +1,58 @@
+"""Players that see the true state: to exercise the arena and to compare learned ones with.
+
+Invariants: a controller plays one episode, and is called with each of its scenes in turn, so that
+it may remember; every random number comes from the injected generator. All see the scene itself,
+which the paper's agents never do: say so wherever one stands beside a learned policy.
+"""
+
+import difflib
+
+import numpy as np
+
+from common.arena.controllers.heading import Controller, shortest_assignment
+from common.arena.controllers.nearest import greedy_actions, random_actions
+from common.arena.controllers.orca import Orca
+from common.arena.controllers.potential_field import PotentialField
+from common.arena.controllers.safe_circle import SafeCircle
+from common.config import ArenaConfig
+from common.errors import ConfigError
+
+__all__ = [
+    "CONTROLLERS",
+    "Controller",
+    "Orca",
+    "PotentialField",
+    "SafeCircle",
+    "check_controller",
+    "controller",
+    "greedy_actions",
+    "random_actions",
+    "shortest_assignment",
+]
+
+CONTROLLERS = ("random", "greedy", "potential_field", "orca", "safe_circle")
+"""Names that `controller` takes."""
+
+
+def check_controller(name: str) -> str:
+    """The name; raises ConfigError, with the nearest right one, where nothing is called so."""
+    if name in CONTROLLERS:
+        return name
+    near = difflib.get_close_matches(name, CONTROLLERS, n=1, cutoff=0.4)
+    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(CONTROLLERS)}"
+    raise ConfigError(f"unknown controller {name!r}; {hint}")
+
+
+def controller(name: str, config: ArenaConfig, rng: np.random.Generator) -> Controller:
+    """A new controller for one episode; raises ConfigError for an unknown name."""
+    match check_controller(name):
+        case "greedy":
+            return lambda scene: greedy_actions(scene, config)
+        case "potential_field":
+            return PotentialField(config)
+        case "orca":
+            return Orca(config)
+        case "safe_circle":
+            return SafeCircle(config)
+        case _:
+            return lambda scene: random_actions(scene, rng)

@@ -1,0 +1,117 @@
+"""Hungarian assignment and optimal reciprocal collision avoidance (van den Berg et al. 2011).
+
+ORCA chooses velocities, of which a robot here has few: the chosen one is mapped onto the action
+that turns nearest to it, and onto a circle where it is slow. A robot's disc is enlarged by the way
+it swerves while it does so.
+
+Invariants: sees the true state, which the paper's agents do not; the assignment of the episode's
+first scene is kept; velocities are px a frame.
+"""
+
+import math
+
+import numpy as np
+
+from common.arena.controllers.heading import (
+    actions_towards,
+    bearings_rad,
+    directions,
+    shortest_assignment,
+)
+from common.arena.layout import reachable_px
+from common.arena.scene import LEFT, Scene
+from common.config import ArenaConfig
+from common.trajectory import Float64Array, Int64Array, UInt8Array
+
+_HORIZON_FRAMES = 30.0  # tau: collisions sooner than this are avoided
+_SLOW = 0.5  # share of the speed below which a velocity is answered by a circle
+_EASE = 0.2  # px a frame of preferred speed for each px to the target, near it
+_SPEEDS, _HEADINGS = 8, 64  # velocities tried beside the preferred one
+
+
+class Orca:
+    """Of the velocities v in all half-planes n . v >= bound, the nearest to the preferred one."""
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self._config = config
+        swerve = config.step_px / (2 * math.sin(math.radians(config.turn_deg) / 2))
+        self._radius = config.robot_radius_px + swerve
+        self._low, self._high = (reachable_px(config)[0] + swerve, reachable_px(config)[1] - swerve)
+        speeds = np.linspace(0, config.step_px, _SPEEDS + 1)
+        around = directions(np.linspace(0, 2 * math.pi, _HEADINGS, endpoint=False))
+        self._tried = (speeds[:, None, None] * around).reshape(-1, 2)
+        self._assignment: Int64Array | None = None
+        self._velocities = np.zeros((config.num_robots, 2))
+
+    def __call__(self, scene: Scene) -> UInt8Array:
+        """Actions [K]."""
+        if self._assignment is None:
+            self._assignment = shortest_assignment(scene)
+        places = scene.robots[:, :2]
+        wishes = self._wishes(scene.targets[self._assignment] - places)
+        self._velocities = np.stack(
+            [self._nearest(wish, *self._half_planes(i, places)) for i, wish in enumerate(wishes)]
+        )
+        speeds = np.linalg.norm(self._velocities, axis=1)
+        towards = actions_towards(scene.robots[:, 2], bearings_rad(self._velocities), self._config)
+        return np.where(speeds < _SLOW * self._config.step_px, np.uint8(LEFT), towards)
+
+    def _wishes(self, aims: Float64Array) -> Float64Array:
+        """Preferred velocities [K, 2]: straight to the target, slower on it."""
+        distances = np.linalg.norm(aims, axis=1, keepdims=True)
+        wishes: Float64Array = aims * np.minimum(
+            self._config.step_px / np.maximum(distances, 1e-9), _EASE
+        )
+        return wishes
+
+    def _half_planes(self, i: int, places: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Normals [N, 2] and bounds [N] of robot i, for the others and the walls."""
+        others = np.arange(len(places)) != i
+        normals, bounds = self._from_robots(
+            places[others] - places[i], self._velocities[i], self._velocities[others]
+        )
+        walls = np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+        gaps = np.concatenate([places[i] - self._low, self._high - places[i]])
+        return np.concatenate([normals, walls]), np.concatenate([bounds, -gaps / _HORIZON_FRAMES])
+
+    def _from_robots(
+        self, apart: Float64Array, own: Float64Array, velocities: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """Of others at `apart` [M, 2]: each side takes half of the least change that avoids."""
+        relative = own - velocities
+        reach = 2 * self._radius
+        distances = np.linalg.norm(apart, axis=1)
+        overlap = distances <= reach
+        # The cut-off disc: of the velocities that touch within the horizon, or at once if they do.
+        horizon = np.where(overlap, 1.0, _HORIZON_FRAMES)[:, None]
+        from_disc = relative - apart / horizon
+        disc_way = np.linalg.norm(from_disc, axis=1, keepdims=True)
+        disc_normal = from_disc / np.maximum(disc_way, 1e-9)
+        disc_change = (reach / horizon - disc_way) * disc_normal
+        # The legs of the cone, on the side where the relative velocity lies.
+        side = np.where(_cross(apart, from_disc) > 0, 1.0, -1.0)
+        bearing = bearings_rad(apart)
+        half = np.arcsin(np.clip(reach / np.maximum(distances, 1e-9), -1, 1))
+        leg = directions(bearing + side * half)
+        leg_normal = side[:, None] * np.stack([-leg[:, 1], leg[:, 0]], axis=1)
+        leg_change = (relative * leg).sum(axis=1, keepdims=True) * leg - relative
+        along = (from_disc * apart).sum(axis=1)
+        on_disc = overlap | ((along < 0) & (along**2 > (reach * disc_way[:, 0]) ** 2))
+        normals = np.where(on_disc[:, None], disc_normal, leg_normal)
+        changes = np.where(on_disc[:, None], disc_change, leg_change)
+        bounds = (normals * (own + changes / 2)).sum(axis=1)
+        return normals, bounds
+
+    def _nearest(
+        self, wish: Float64Array, normals: Float64Array, bounds: Float64Array
+    ) -> Float64Array:
+        """Of the velocities tried that break the half-planes least, the nearest to the wish."""
+        tried = np.concatenate([wish[None], self._tried])
+        broken = np.maximum(bounds - tried @ normals.T, 0).max(axis=1)
+        away = np.linalg.norm(tried - wish, axis=1)
+        nearest: Float64Array = tried[np.lexsort((away, np.round(broken, 3)))[0]]
+        return nearest
+
+
+def _cross(a: Float64Array, b: Float64Array) -> Float64Array:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
