@@ -82,6 +82,7 @@ class Arena:
             rewards=np.zeros(shape[0], np.float32),
             discount=1.0,
             collided=np.zeros(shape[0], np.bool_),
+            hit_wall=np.zeros(shape[0], np.bool_),
         )
 
     def step(self, actions: ArrayLike) -> TimeStep:
@@ -105,6 +106,7 @@ class Arena:
             rewards=rewards,
             discount=0.0 if terminated else 1.0,
             collided=collided,
+            hit_wall=self._world.hit_wall,
             outcome=outcome,
         )
 

@@ -97,6 +97,7 @@ class CountingArena:
             rewards=np.full(self._num_robots, reward, np.float32),
             discount=0.0 if outcome is Outcome.SUCCESS else 1.0,
             collided=np.zeros(self._num_robots, np.bool_),
+            hit_wall=np.zeros(self._num_robots, np.bool_),
             outcome=outcome,
         )
 

@@ -65,6 +65,8 @@ class World:
             if self._space.shape_query(shape):
                 raise ValueError(f"robot {i} at {self._poses[i]} overlaps another")
         self._back_off = [0] * len(self._poses)
+        self.hit_wall: BoolArray = np.zeros(len(self._poses), np.bool_)
+        """Of those that collided in the last move [K], whose way led beyond a wall."""
 
     def move(self, actions: UInt8Array) -> BoolArray:
         """Turns and moves every robot at once; returns who collided [K].
@@ -85,13 +87,19 @@ class World:
             turned[i] if i in blocked else proposal for i, proposal in enumerate(proposals)
         ]
         collided = np.zeros(len(proposals), np.bool_)
+        self.hit_wall = np.zeros(len(proposals), np.bool_)
         for i, frames in enumerate(self._back_off):
             if frames:
                 self._back_off[i] = frames - 1
             elif i in blocked:
                 self._back_off[i] = self._config.back_off_frames
                 collided[i] = True
+                self.hit_wall[i] = self._beyond_wall(proposals[i])
         return collided
+
+    def _beyond_wall(self, pose: Pose) -> bool:
+        low, high = self._free_low - _SLACK_PX, self._free_high + _SLACK_PX
+        return not (low <= pose[0] <= high and low <= pose[1] <= high)
 
     def _turn(self, i: int, action: int) -> Pose:
         x, y, heading = self._poses[i]

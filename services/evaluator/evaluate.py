@@ -11,6 +11,7 @@ from rich.progress import Progress
 
 from common.arena import test_starts
 from common.trajectory import Evaluation
+from services.evaluator.navigation import Navigation, navigation, navigation_table
 from services.evaluator.score import evaluation
 from services.evaluator.subject import Subject, subject, subject_parser
 from services.evaluator.trial import play
@@ -29,21 +30,24 @@ def main(argv: Sequence[str]) -> int:
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("episodes", total=arguments.episodes)
-        result = judge(
+        result, measures = judge(
             judged,
             arguments.episodes,
             arguments.seed,
             lambda done: progress.update(task, completed=done),
         )
     if arguments.json:
-        print(json.dumps(dataclasses.asdict(result)))
+        navigated = {"navigation": dataclasses.asdict(measures)}
+        print(json.dumps(dataclasses.asdict(result) | navigated))
     else:
-        sys.stdout.write(table(result, judged))
+        sys.stdout.write(table(result, judged) + navigation_table(measures))
     return 0
 
 
-def judge(judged: Subject, episodes: int, seed: int, report: Callable[[int], None]) -> Evaluation:
-    """The evaluation; `report` is told how many episodes are done."""
+def judge(
+    judged: Subject, episodes: int, seed: int, report: Callable[[int], None]
+) -> tuple[Evaluation, Navigation]:
+    """The paper's measures and those of navigation; `report` is told how many episodes are done."""
     began_s = time.monotonic()
     starts = test_starts(judged.config.arena, episodes, seed)
 
@@ -51,15 +55,17 @@ def judge(judged: Subject, episodes: int, seed: int, report: Callable[[int], Non
         report(done)
         return True
 
-    results = play(judged.config.arena, starts, judged.player(seed), go_on=go_on)
-    return evaluation(
-        results or [],
+    results = play(judged.config.arena, starts, judged.player(seed), go_on=go_on) or []
+    result = evaluation(
+        results,
         worker=judged.controller or "evaluate",
         weights=judged.weights,
         num_robots=judged.config.arena.num_robots,
         seed=seed,
         wall_s=time.monotonic() - began_s,
     )
+    outcomes, frames = [r.outcome for r in results], [r.frames for r in results]
+    return result, navigation(outcomes, frames, [r.journey for r in results])
 
 
 def table(result: Evaluation, judged: Subject) -> str:
@@ -77,5 +83,4 @@ def table(result: Evaluation, judged: Subject) -> str:
   time-out   {result.timeout_rate:7.2%}
   successes per 100: max {result.max_per_100:.0f}, average {result.mean_per_100:.2f}, \
 variance {result.variance_per_100:.2f}
-  frames to success: {result.mean_frames:.0f}
 """

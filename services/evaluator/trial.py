@@ -5,7 +5,7 @@ once, each arena taking the next start when its episode ends.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from common.arena.controllers import Controller
 from common.config import ArenaConfig
 from common.policy import FrameStack, Policy
 from common.trajectory import NUM_ACTIONS, Float64Array, Outcome, TimeStep, UInt8Array
+from services.evaluator.navigation import Journey, journey
 
 _MAX_ARENAS = 64
 PER = 100  # episodes a block of Table 2
@@ -30,6 +31,7 @@ class EpisodeResult:
     score: float  # sum of rewards, mean over robots
     targets: Float64Array  # [K, 2] px
     robots: Float64Array  # [frames + 1, K, 3]; [0, K, 3] where paths are not kept
+    journey: Journey
 
 
 class Player(Protocol):
@@ -119,8 +121,8 @@ class _Running:
     """An episode under way."""
 
     number: int
-    score: float
-    path: list[Float64Array]
+    score: float = 0.0
+    path: list[Float64Array] = field(default_factory=list)
 
 
 def play(
@@ -145,7 +147,7 @@ def play(
             return
         number, start = following
         player.begin(index, arenas[index].reset(start))
-        running[index] = _Running(number, 0.0, [arenas[index].scene.robots])
+        running[index] = _Running(number)
 
     for index in range(len(arenas)):
         begin(index)
@@ -153,21 +155,40 @@ def play(
         if not go_on(len(results)):
             return None
         active = np.array(sorted(running))
-        actions = player.act(active, [arenas[i].scene for i in active])
+        scenes = [arenas[i].scene for i in active]
+        actions = player.act(active, scenes)
         steps = [arenas[i].step(a) for i, a in zip(active, actions, strict=True)]
         player.observe(active, np.stack([s.records for s in steps]))
-        for index, time_step in zip(active.tolist(), steps, strict=True):
+        for index, scene, time_step in zip(active.tolist(), scenes, steps, strict=True):
             episode = running[index]
             episode.score += float(time_step.rewards.mean())
-            if keep_paths:
-                episode.path.append(arenas[index].scene.robots)
+            episode.path.append(scene.robots)
             if time_step.outcome is not None:
-                results[episode.number] = EpisodeResult(
-                    outcome=time_step.outcome,
-                    frames=arenas[index].frame,
-                    score=episode.score,
-                    targets=arenas[index].scene.targets,
-                    robots=np.stack(episode.path) if keep_paths else np.empty((0, 0, 3)),
+                results[episode.number] = _result(
+                    config, episode, arenas[index], time_step, keep_paths
                 )
                 begin(index)
     return [results[number] for number in range(len(starts))]
+
+
+def _result(
+    config: ArenaConfig, episode: _Running, arena: Arena, last: TimeStep, keep_path: bool
+) -> EpisodeResult:
+    """Of an episode whose arena stands at its last time step."""
+    if last.outcome is None:
+        raise ValueError("the episode has not ended")
+    path = np.stack([*episode.path, arena.scene.robots])
+    return EpisodeResult(
+        outcome=last.outcome,
+        frames=arena.frame,
+        score=episode.score,
+        targets=arena.scene.targets,
+        robots=path if keep_path else path[:0],
+        journey=journey(
+            path,
+            arena.scene.targets,
+            last.collided & ~last.hit_wall,
+            last.hit_wall,
+            config.robot_radius_px,
+        ),
+    )

@@ -6,14 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.trajectory import Evaluation, Outcome, Weights
+from services.evaluator.navigation import Journey
 from services.evaluator.score import evaluation, successes_per_100, wilson_interval
 from services.evaluator.trial import EpisodeResult
 
+JOURNEY = Journey(np.ones(2), np.ones(2), np.ones(2), np.zeros(2, np.bool_), np.zeros(2, np.bool_))
 SUCCESS, COLLISION, TIMEOUT = Outcome.SUCCESS, Outcome.COLLISION, Outcome.TIMEOUT
 
 
 def episode(outcome: Outcome, frames: int = 10, score: float = 1.0) -> EpisodeResult:
-    return EpisodeResult(outcome, frames, score, np.zeros((2, 2)), np.empty((0, 2, 3)))
+    return EpisodeResult(outcome, frames, score, np.zeros((2, 2)), np.empty((0, 2, 3)), JOURNEY)
 
 
 def judged(results: list[EpisodeResult]) -> Evaluation:
