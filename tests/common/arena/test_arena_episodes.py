@@ -6,11 +6,14 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from common.arena import (
     Arena,
     CountingArena,
     Start,
+    Symmetry,
     make_arena,
     make_codec,
     starts,
@@ -163,3 +166,29 @@ def test_a_seed_gives_the_same_play_in_another_process() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert other.stdout.strip() == fingerprint()
+
+
+@settings(max_examples=16)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    flags=st.tuples(st.booleans(), st.booleans(), st.booleans()),
+)
+def test_a_mapped_arena_pays_and_ends_the_same(seed: int, flags: tuple[bool, bool, bool]) -> None:
+    symmetry = Symmetry(*flags)
+    config = ArenaConfig(num_robots=3, size_px=270, max_collisions=20, max_frames=60)
+    rng = np.random.default_rng(seed)
+    one, other = Arena(config, rng), Arena(config, rng)
+    one.reset()
+    scene = one.scene
+    mapped = symmetry.apply_to_scene(scene, config.size_px)
+    one.reset(Start(scene.robots, scene.targets))
+    other.reset(Start(mapped.robots, mapped.targets))
+    running = True
+    while running:
+        moves = rng.integers(0, 3, 3, dtype=np.uint8)
+        step, same = one.step(moves), other.step(symmetry.apply_to_actions(moves))
+        np.testing.assert_allclose(same.rewards, step.rewards, atol=1e-5)
+        np.testing.assert_array_equal(same.collided, step.collided)
+        np.testing.assert_array_equal(same.hit_wall, step.hit_wall)
+        assert same.outcome is step.outcome
+        running = not step.last

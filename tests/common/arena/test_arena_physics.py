@@ -196,11 +196,17 @@ def by_the_rule(
 def test_pymunk_finds_what_the_rule_says() -> None:
     config, robots, rng = crowd(1)
     arena = World(config, robots)
+    low, high = reachable_px(config)
     seen = 0
     for _ in range(1000):
         moves = rng.integers(0, 3, 5, dtype=np.uint8)
         expected, blocked = by_the_rule(config, arena.robots, moves.astype(np.float64))
+        turned = arena.robots[:, 2] + (moves - 1.0) * TURN
+        ways = config.step_px * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+        proposals = arena.robots[:, :2] + ways
         np.testing.assert_array_equal(arena.move(moves), blocked)
+        beyond = ((proposals < low) | (proposals > high)).any(axis=1)
+        np.testing.assert_array_equal(arena.hit_wall, beyond)
         np.testing.assert_allclose(arena.robots[:, :2], expected[:, :2], atol=1e-9)
         seen += int(blocked.sum())
     assert seen > 100
