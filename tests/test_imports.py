@@ -24,6 +24,8 @@ PLACES = {
     "cv2": ("common/arena",),
     "numba": ("common/arena",),
     "scipy": ("common/arena/controllers",),
+    "pettingzoo": ("common/arena/parallel_env.py",),
+    "gymnasium": ("common/arena/parallel_env.py", "common/arena/vector_env.py"),
     "pydantic": ("common/config.py",),
     "torch": (
         "common/network.py",
