@@ -18,6 +18,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from common.arena.controllers import CONTROLLERS
 from common.config import Config, TransportConfig, preset_names
 from common.keys import Keys
 from common.network import QNetwork, weights_to_bytes
@@ -40,6 +41,7 @@ from services.dashboard.recorder import EVALUATION_FIELDS, RATES, flat_metrics
 from services.dashboard.records import EpisodeRecord, EvaluationRecord
 from services.dashboard.state import RunState
 from services.dashboard.summary import summary
+from services.evaluator.navigation import Navigation, RobotNavigation
 from services.learner.meter import Meter
 from services.replay.__main__ import build
 from services.replay.service import ReplayService
@@ -297,6 +299,19 @@ def test_tensorboard_tags_are_documented() -> None:
             else:
                 assert ast.unparse(tag)[2:].split("/")[0] in {"evaluation", "rates", "learner"}
     assert set(names(part(page("metrics.md"), "## TensorBoard"))) == tags
+
+
+# -- arena -------------------------------------------------------------------------------
+
+
+def test_controllers_are_documented() -> None:
+    assert names(part(page("arena.md"), "## Controllers")) == list(CONTROLLERS)
+
+
+def test_measures_of_navigation_are_documented() -> None:
+    measured = [field.name for of in (Navigation, RobotNavigation) for field in fields(of)]
+    described = names(part(page("arena.md"), "## Measures of navigation"))
+    assert [name for name in described if not name.startswith("field")] == measured
 
 
 # -- commands ----------------------------------------------------------------------------
