@@ -50,6 +50,11 @@ def test_a_controller_is_judged_the_same_for_the_same_seed(tmp_path: Path) -> No
     assert first["success_rate"] > 0.5  # it sees the true state
     assert first["max_per_100"] >= first["mean_per_100"] >= 0
     assert first["variance_per_100"] >= 0
+    navigation = first["navigation"]
+    assert navigation["success_rate"] == first["success_rate"]
+    collided = [navigation[f"collision_with_{whom}_rate"] for whom in ("robot", "wall")]
+    assert sum(collided) == pytest.approx(first["collision_rate"])
+    assert len(navigation["robots"]) == 2
 
 
 def test_weights_are_judged_in_the_arena_of_their_run(finished: Finished, tmp_path: Path) -> None:
