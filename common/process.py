@@ -110,9 +110,8 @@ def joining_arguments(role: str, argv: Sequence[str]) -> Joining:
     transport = load_config(
         None, {k: v for k, v in given.items() if k.startswith("transport.")}
     ).transport
-    if arguments.connect or not transport.connect:
-        endpoints = tuple(arguments.connect or [_noted_endpoint(run_dir)])
-        transport = transport.model_copy(update={"connect": endpoints})
+    endpoints = tuple(arguments.connect or transport.connect or [_noted_endpoint(run_dir)])
+    transport = transport.model_copy(update={"connect": endpoints, "listen": ()})
     return Joining(arguments.run, check_name(worker, "--id"), run_dir, transport, given)
 
 

@@ -8,6 +8,7 @@ declared. What Zenoh loses and when: docs/wire.md.
 import contextlib
 import json
 import queue
+import re
 import socket
 import threading
 import time
@@ -21,6 +22,7 @@ from common.config import TransportConfig
 from common.errors import DeadlineError, EndpointError, HeldError, RefusedError, TransportError
 
 _HELD = "held: "
+_ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _OPEN_ATTEMPT_MS = 2_000
 
 
@@ -343,6 +345,9 @@ def free_endpoint() -> str:
 def _open(config: TransportConfig, deadline: float) -> zenoh.Session:
     if not config.listen and not config.connect:
         raise EndpointError("no endpoint: give --connect or --listen, such as tcp/127.0.0.1:7447")
+    for endpoint in (*config.listen, *config.connect):
+        if not _ENDPOINT.fullmatch(endpoint):
+            raise EndpointError(f"{endpoint!r} is no endpoint; write one as tcp/127.0.0.1:7447")
     while True:
         try:
             return zenoh.open(_zenoh_config(config))

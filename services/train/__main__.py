@@ -78,8 +78,9 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     if arguments.resume:
         if arguments.name or arguments.config:
             parser.error("--resume keeps the run's name and configuration: no --name or --config")
-        name = check_name(Path(arguments.resume).name, "run name")
-        return RunDirectory.resume(arguments.run_dir / name, given)
+        resumed = Path(arguments.resume)
+        folder = resumed.parent if len(resumed.parts) > 1 else arguments.run_dir
+        return RunDirectory.resume(folder / check_name(resumed.name, "run name"), given)
     preset = arguments.config or _DEFAULT
     config = load_config(preset, given)
     check_possible(config)

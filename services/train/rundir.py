@@ -21,6 +21,7 @@ from common.files import atomic_write, reason
 from common.process import ENDPOINT_FILE
 
 CONFIG_FILE = "config.toml"
+_KEPT = ("arena.", "agent.kind")  # what checkpoints and the replay log were made with
 
 
 def default_name(config_name: str, num_robots: int) -> str:
@@ -69,6 +70,12 @@ class RunDirectory:
         """A folder there is, with its configuration and what the flags change in it."""
         if not (path / CONFIG_FILE).is_file():
             raise RunDirectoryError(f"{path} holds no run ({CONFIG_FILE} is missing)")
+        for name in overrides:
+            if name.startswith(_KEPT):
+                raise RunDirectoryError(
+                    f"{path} keeps its arena and its agent, so {name} cannot be changed; "
+                    "start a new run for that"
+                )
         config = load_config(str(path / CONFIG_FILE), overrides)
         return cls._opened(path, config, resumed=True)
 

@@ -380,3 +380,9 @@ def test_the_with_block_leaves_neither_session_nor_thread_nor_port() -> None:
 def test_a_free_endpoint_is_free() -> None:
     with Session(TransportConfig(listen=(free_endpoint(),))) as session:
         assert "open" in repr(session)
+
+
+@pytest.mark.parametrize("endpoint", ["tcp", "127.0.0.1:7447", "tcp/", ""])
+def test_a_malformed_endpoint_is_refused_at_once(endpoint: str) -> None:
+    with pytest.raises(EndpointError, match="is no endpoint"):
+        Session(TransportConfig(connect=(endpoint,)))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from common.config import load_config
+from common.config import Config, load_config
 from common.errors import ConfigError, RunDirectoryError
 from services.train.rundir import CONFIG_FILE, RunDirectory, default_name
 
@@ -109,3 +109,12 @@ def test_a_file_in_place_of_the_logs_is_one_line(path: Path) -> None:
 @pytest.mark.parametrize("config", ["quick", "some/where/quick.toml"])
 def test_a_name_is_made_of_preset_robots_and_time(config: str) -> None:
     assert default_name(config, 3).startswith("quick-3robots-2")
+
+
+@pytest.mark.parametrize("name", ["arena.num_robots", "agent.kind"])
+def test_a_resumed_run_keeps_its_arena_and_agent(tmp_path: Path, name: str) -> None:
+    RunDirectory.create(tmp_path / "run", Config()).close()
+    before = (tmp_path / "run" / "config.toml").read_bytes()
+    with pytest.raises(RunDirectoryError, match=f"{name} cannot be changed"):
+        RunDirectory.resume(tmp_path / "run", {name: "3"})
+    assert (tmp_path / "run" / "config.toml").read_bytes() == before
