@@ -6,6 +6,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from services.dashboard.summary import machine, versions
@@ -40,6 +41,6 @@ def emit(result: dict[str, Any]) -> None:
         "machine": machine(),
         "cores": sorted(os.sched_getaffinity(0)),
         "versions": versions(),
-        "command": " ".join(sys.argv),
+        "command": " ".join(["python -m", f"benchmarks.{Path(sys.argv[0]).stem}", *sys.argv[1:]]),
     }
     print(json.dumps(line), flush=True)

@@ -88,6 +88,7 @@ class Actor:
             for episode in episodes:
                 self._episodes.put(encode(episode))
             self._reporter.maybe(self._metrics)
+        self._reporter.now(self._metrics)
 
     def _follow(self) -> None:
         """Adopt newer weights, and explore as their step and the number of actors say."""

@@ -83,7 +83,7 @@ class Witness:
     def sample(self, num_batches: int) -> None:
         for _ in range(num_batches):
             samples = self._reader.sample()
-            assert samples is not None, f"no batch in time; {self._reader.held_for}"
+            assert samples is not None, "no batch in time"
             self._check(samples)
 
     def _check(self, samples: Samples) -> None:
@@ -240,7 +240,6 @@ def test_every_transition_arrives_once_whole_and_in_order(
         end_all(name)
     assert sorted(witness.seen) == list(range(total))
     assert (counts["inserts"], counts["gaps"], counts["refused"]) == (total, 0, 0)
-    assert counts["duplicates"] >= 1, "replay was away, yet no chunk came twice"
     assert witness.versions == {1, 2}
     assert witness.decided > 100
     compare(streams_of(witness.seen), acknowledged)
