@@ -29,6 +29,7 @@ from common.wire import encode
 
 ENDPOINT_FILE = "endpoint"
 DIE_WITH_PARENT = "MRCDRL_DIE_WITH_PARENT"  # its process id, set by who starts services
+STOP_DEADLINE_S = 30  # of a service, from the signal to its end
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -38,15 +39,22 @@ class StopSignal:
 
     def __init__(self) -> None:
         self._event = threading.Event()
+        self._deadline_s = 0
 
-    def listen(self) -> "StopSignal":
-        """Have SIGTERM and SIGINT set it; call from the main thread."""
+    def listen(self, deadline_s: int = 0) -> "StopSignal":
+        """Have SIGTERM and SIGINT set it; call from the main thread.
+
+        deadline_s: if above 0, a process still there so long after the signal is ended by the
+        kernel, whatever it waits for.
+        """
+        self._deadline_s = deadline_s
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)
         return self
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self._event.set()
+        signal.alarm(self._deadline_s)
 
     def set(self) -> None:
         self._event.set()

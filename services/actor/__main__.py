@@ -15,6 +15,7 @@ from common.errors import CheckpointError
 from common.exploration import epsilons
 from common.policy import Policy, make_policy
 from common.process import (
+    STOP_DEADLINE_S,
     Joining,
     StatsReporter,
     StopSignal,
@@ -37,7 +38,7 @@ _LOG = logging.getLogger("actor")
 def main(argv: Sequence[str]) -> int:
     """Collect for a run; the exit code."""
     joining = joining_arguments("actor", argv)
-    stop = StopSignal().listen()
+    stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
         config = fetch_config(session, joining, stop)
         torch.set_num_threads(config.actor.threads)

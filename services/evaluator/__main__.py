@@ -17,6 +17,7 @@ from common.errors import CheckpointError
 from common.files import read_weights, write_weights
 from common.policy import make_policy
 from common.process import (
+    STOP_DEADLINE_S,
     Joining,
     StatsReporter,
     StopSignal,
@@ -40,7 +41,7 @@ BEST = Path("checkpoints") / "best.safetensors"
 def main(argv: Sequence[str]) -> int:
     """Judge for a run; the exit code."""
     joining = joining_arguments("evaluator", argv)
-    stop = StopSignal().listen()
+    stop = StopSignal().listen(STOP_DEADLINE_S)
     os.nice(_NICE)
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)

@@ -10,6 +10,7 @@ import torch
 from common.arena import layout_symmetries, make_codec
 from common.config import Config
 from common.process import (
+    STOP_DEADLINE_S,
     StatsReporter,
     StopSignal,
     available_cores,
@@ -36,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     """Learn for a run; the exit code."""
     joining = joining_arguments("learner", argv)
     keys, worker = joining.keys, joining.worker
-    stop = StopSignal().listen()
+    stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
         config = fetch_config(session, joining, stop)
         settings = config.learner

@@ -10,7 +10,7 @@ import numpy as np
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, ReplayConfig, load_config, to_toml
 from common.keys import Keys, check_name
-from common.process import StatsReporter, StopSignal, run_main
+from common.process import STOP_DEADLINE_S, StatsReporter, StopSignal, run_main
 from common.transport import Session
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     )
     keys = Keys(arguments.run)
     worker = check_name(arguments.id, "--id")
-    stop = StopSignal().listen()
+    stop = StopSignal().listen(STOP_DEADLINE_S)
     table, limiter = build(config)
     log = open_log(config, arguments.run_dir / arguments.run / "replay" / "0")
     with Session(transport) as session:

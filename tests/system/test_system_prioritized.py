@@ -14,7 +14,7 @@ def test_a_prioritized_run_ends_well_and_has_set_priorities(tmp_path: Path) -> N
     name = run_name("prioritized")
     arguments = ["train", "--config", "smoke", "--run-dir", tmp_path, "--name", name, *SMALL]
     prioritized = ["--replay.sampler=prioritized", "--replay.importance_exponent_final=1.0"]
-    brief = ["--learner-steps", "60", "--run.evaluators", "0"]
+    brief = ["--learner-steps", "600", "--run.evaluators", "0"]
     try:
         with Command([*arguments, *prioritized, *brief], tmp_path) as train:
             assert train.wait() == 0, train.err
@@ -23,7 +23,7 @@ def test_a_prioritized_run_ends_well_and_has_set_priorities(tmp_path: Path) -> N
         end_all(name)
     assert "Traceback" not in train.err
     run = tmp_path / name
-    assert json.loads((run / "summary.json").read_bytes())["learner_steps"] == 60
+    assert json.loads((run / "summary.json").read_bytes())["learner_steps"] == 600
     told = [
         metrics
         for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()
