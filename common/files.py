@@ -14,6 +14,7 @@ from typing import Any
 from common.errors import CheckpointError
 
 TEMPORARY_SUFFIX = ".part"
+BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"  # of a run's folder
 
 
 def write_synced(path: Path, content: bytes) -> None:

@@ -14,7 +14,7 @@ import torch
 from common.arena import Start, make_codec, test_starts
 from common.config import Config
 from common.errors import CheckpointError
-from common.files import read_weights, write_weights
+from common.files import BEST_WEIGHTS, read_weights, write_weights
 from common.policy import make_policy
 from common.process import (
     STOP_DEADLINE_S,
@@ -35,7 +35,6 @@ from services.evaluator.trial import PolicyPlayer, play
 _LOG = logging.getLogger("evaluator")
 _POLL_S = 0.2
 _NICE = 10  # judging gives way to learning where they share cores
-BEST = Path("checkpoints") / "best.safetensors"
 
 
 def main(argv: Sequence[str]) -> int:
@@ -63,7 +62,7 @@ class Evaluator:
         self._stop = stop
         self._reader = WeightsReader(session, keys)
         self._judge = Judge(config, worker)
-        self._best = Best(joining.run_dir / BEST)
+        self._best = Best(joining.run_dir / BEST_WEIGHTS)
         self._publisher = session.publisher(keys.evaluation(worker))
         self._reporter = StatsReporter(
             session.publisher(keys.stats("evaluator", worker)), "evaluator", worker

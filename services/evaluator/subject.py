@@ -14,7 +14,7 @@ from common.arena.controllers import CONTROLLERS, check_controller, controller
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, load_config
 from common.errors import CheckpointError, ConfigError
-from common.files import read_weights
+from common.files import BEST_WEIGHTS, read_weights
 from common.network import network_from_bytes, precision
 from common.policy import Policy
 from common.trajectory import Weights
@@ -22,7 +22,6 @@ from services.evaluator.trial import ControllerPlayer, Player, PolicyPlayer
 
 _RUN_CONFIG = "config.toml"
 _MANIFEST = "manifest.json"
-_BEST = Path("checkpoints") / "best.safetensors"
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ def weights_path(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    found = [path / _BEST, *sorted(path.glob("checkpoints/step_*/model.safetensors"))[::-1]]
+    found = [path / BEST_WEIGHTS, *sorted(path.glob("checkpoints/step_*/model.safetensors"))[::-1]]
     for candidate in (*found, path / "model.safetensors"):
         if candidate.is_file():
             return candidate

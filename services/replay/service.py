@@ -8,6 +8,7 @@ to try again.
 import logging
 import threading
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 from common.config import Config
@@ -127,7 +128,7 @@ class ReplayService:
                 **self._held,
             }
 
-    def _serve(self, server: _Server, answer: "_Answer") -> None:
+    def _serve(self, server: _Server, answer: Callable[[_Request], None]) -> None:
         while not self._stopping.is_set():
             request = server.take(_TAKE_S)
             if request is None:
@@ -222,7 +223,7 @@ class ReplayService:
             self._counts["priorities_ignored"] += ignored
         request.reply(encode(PrioritiesReply(updated, ignored)))
 
-    def _wait(self, flag: str, request: _Request, ready: "_Ready") -> bool:
+    def _wait(self, flag: str, request: _Request, ready: Callable[[], bool]) -> bool:
         """Wait, the lock given up meanwhile, until ready; False where that took too long."""
         if ready():
             self._held[flag] = False
@@ -238,11 +239,3 @@ class ReplayService:
         if limiter.inserts < limiter.min_size:
             return f"the table holds {limiter.inserts} of the first {limiter.min_size} transitions"
         return "the actors have not inserted enough for another sample yet"
-
-
-class _Answer(Protocol):
-    def __call__(self, request: _Request) -> None: ...
-
-
-class _Ready(Protocol):
-    def __call__(self) -> bool: ...
