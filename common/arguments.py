@@ -8,7 +8,7 @@ import argparse
 import difflib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 from common.config import sections
@@ -44,19 +44,26 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
 
-def add_config_flags(parser: argparse.ArgumentParser) -> None:
-    """A flag for every field of the configuration."""
+def add_config_flags(
+    parser: argparse.ArgumentParser, short: Mapping[str, str] | None = None
+) -> None:
+    """A flag for every field of the configuration.
+
+    short: shorter spellings, such as {"arena.num_robots": "--robots"}.
+    """
+    shorter = short or {}
     for section, model in sections().items():
         group = parser.add_argument_group(f"[{section}]")
         for name, info in model.model_fields.items():
             text = re.sub(r"\s+", " ", info.description or "").replace("%", "%%")
             default = re.sub(r"\s+", "", str(info.default)).replace("%", "%%")
-            spellings = dict.fromkeys(
-                (f"--{section}.{name}", f"--{section}.{name}".replace("_", "-"))
-            )
+            field = f"{section}.{name}"
+            spellings = dict.fromkeys((f"--{field}", f"--{field}".replace("_", "-")))
+            if field in shorter:
+                spellings[shorter[field]] = None
             group.add_argument(
                 *spellings,
-                dest=f"{_DEST}{section}.{name}",
+                dest=f"{_DEST}{field}",
                 metavar="X",
                 help=f"{text} Default: {default}",
             )

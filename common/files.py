@@ -14,7 +14,8 @@ from typing import Any
 from common.errors import CheckpointError
 
 TEMPORARY_SUFFIX = ".part"
-BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"  # of a run's folder
+RUN_CONFIG = "config.toml"  # of a run's folder, like the next
+BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"
 
 
 def write_synced(path: Path, content: bytes) -> None:

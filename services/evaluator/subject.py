@@ -14,13 +14,12 @@ from common.arena.controllers import CONTROLLERS, check_controller, controller
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, load_config
 from common.errors import CheckpointError, ConfigError
-from common.files import BEST_WEIGHTS, read_weights
+from common.files import BEST_WEIGHTS, RUN_CONFIG, read_weights
 from common.network import network_from_bytes, precision
 from common.policy import Policy
 from common.trajectory import Weights
 from services.evaluator.trial import ControllerPlayer, Player, PolicyPlayer
 
-_RUN_CONFIG = "config.toml"
 _MANIFEST = "manifest.json"
 
 
@@ -48,9 +47,8 @@ def subject_parser(command: str, description: str) -> Parser:
     parser = Parser(prog=f"mrcdrl {command}", description=description)
     parser.add_argument("weights", nargs="?", type=Path, help="a .safetensors file, or a run")
     parser.add_argument("--controller", help=f"instead of weights: {', '.join(CONTROLLERS)}")
-    parser.add_argument("--robots", metavar="K", help="arena.num_robots")
     parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
-    add_config_flags(parser)
+    add_config_flags(parser, {"arena.num_robots": "--robots"})
     return parser
 
 
@@ -63,8 +61,6 @@ def subject(arguments: argparse.Namespace) -> Subject:
     if (arguments.weights is None) == (arguments.controller is None):
         raise ConfigError("give either weights or --controller")
     given = overrides(arguments)
-    if arguments.robots is not None:
-        given["arena.num_robots"] = arguments.robots
     if arguments.controller is not None:
         config = load_config(arguments.config or "quick", given)
         return Subject(config, None, check_controller(arguments.controller), Weights(0, 0, 0, b""))
@@ -112,6 +108,6 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
 def _config_beside(path: Path) -> str:
     """The configuration of the run that the weights lie in; else the preset `quick`."""
     for folder in path.resolve().parents[:3]:
-        if (folder / _RUN_CONFIG).is_file():
-            return str(folder / _RUN_CONFIG)
+        if (folder / RUN_CONFIG).is_file():
+            return str(folder / RUN_CONFIG)
     return "quick"

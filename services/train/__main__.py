@@ -15,6 +15,7 @@ from common.arena import test_starts
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, TransportConfig, load_config
 from common.errors import EndpointError
+from common.files import RUN_CONFIG
 from common.keys import Keys, check_name
 from common.process import StopSignal, available_cores, run_main
 from common.transport import Session, free_endpoint
@@ -24,7 +25,7 @@ from services.dashboard.state import RunState
 from services.dashboard.stopping import StoppingRule
 from services.train.fleet import Fleet
 from services.train.follower import Follower
-from services.train.rundir import CONFIG_FILE, RunDirectory, default_name
+from services.train.rundir import RunDirectory, default_name
 
 _LOG = logging.getLogger("train")
 _DEFAULT = "quick"
@@ -33,6 +34,12 @@ _PLAIN_PERIOD_S = 10.0
 _PICTURES_S = 300.0
 _JOIN_S = 60.0
 _ENOUGH_CORES = 4
+_SHORT = {
+    "arena.num_robots": "--robots",
+    "run.minutes": "--minutes",
+    "run.learner_steps": "--learner-steps",
+    "run.actors": "--actors",
+}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -57,24 +64,12 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     """The run that the command line asks for, its folder made or taken up again."""
     parser = Parser(prog="mrcdrl train", description="Train on this machine, all processes.")
     parser.add_argument("--config", help=f"a preset or a TOML file; by default {_DEFAULT}")
-    parser.add_argument("--robots", metavar="K", help="arena.num_robots")
-    parser.add_argument("--minutes", metavar="M", help="run.minutes")
-    parser.add_argument("--learner-steps", metavar="N", help="run.learner_steps")
-    parser.add_argument("--actors", metavar="N", help="run.actors")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     parser.add_argument("--name", help="the run's name; by default from preset, robots and time")
     parser.add_argument("--resume", metavar="RUN", help="go on with this run where it was")
-    add_config_flags(parser)
+    add_config_flags(parser, _SHORT)
     arguments = parser.parse_args(argv)
     given = overrides(arguments)
-    for flag, field in {
-        "robots": "arena.num_robots",
-        "minutes": "run.minutes",
-        "learner_steps": "run.learner_steps",
-        "actors": "run.actors",
-    }.items():
-        if getattr(arguments, flag) is not None:
-            given[field] = getattr(arguments, flag)
     if arguments.resume:
         if arguments.name or arguments.config:
             parser.error("--resume keeps the run's name and configuration: no --name or --config")
@@ -151,7 +146,7 @@ def join(fleet: Fleet, transport: TransportConfig) -> Session:
 
 
 def replay_arguments(run: RunDirectory, endpoint: str) -> list[str]:
-    config_path = str(run.path / CONFIG_FILE)
+    config_path = str(run.path / RUN_CONFIG)
     run_dir = str(run.path.parent)
     name = run.path.name
     return ["--run", name, "--config", config_path, "--listen", endpoint, "--run-dir", run_dir]

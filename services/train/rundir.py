@@ -17,10 +17,9 @@ from typing import Self
 
 from common.config import Config, load_config, to_toml
 from common.errors import RunDirectoryError
-from common.files import atomic_write, reason
+from common.files import RUN_CONFIG, atomic_write, reason
 from common.process import ENDPOINT_FILE
 
-CONFIG_FILE = "config.toml"
 _KEPT = ("arena.", "agent.kind")  # what checkpoints and the replay log were made with
 
 
@@ -68,15 +67,15 @@ class RunDirectory:
     @classmethod
     def resume(cls, path: Path, overrides: dict[str, str]) -> Self:
         """A folder there is, with its configuration and what the flags change in it."""
-        if not (path / CONFIG_FILE).is_file():
-            raise RunDirectoryError(f"{path} holds no run ({CONFIG_FILE} is missing)")
+        if not (path / RUN_CONFIG).is_file():
+            raise RunDirectoryError(f"{path} holds no run ({RUN_CONFIG} is missing)")
         for name in overrides:
             if name.startswith(_KEPT):
                 raise RunDirectoryError(
                     f"{path} keeps its arena and its agent, so {name} cannot be changed; "
                     "start a new run for that"
                 )
-        config = load_config(str(path / CONFIG_FILE), overrides)
+        config = load_config(str(path / RUN_CONFIG), overrides)
         return cls._opened(path, config, resumed=True)
 
     @classmethod
@@ -84,7 +83,7 @@ class RunDirectory:
         try:
             run = cls(path, config, resumed=resumed)
             run.logs.mkdir(exist_ok=True)
-            atomic_write(path / CONFIG_FILE, to_toml(config).encode())
+            atomic_write(path / RUN_CONFIG, to_toml(config).encode())
         except OSError as error:
             raise RunDirectoryError(f"cannot write {path}: {reason(error)}") from error
         return run

@@ -7,7 +7,8 @@ import pytest
 
 from common.config import Config, load_config
 from common.errors import ConfigError, RunDirectoryError
-from services.train.rundir import CONFIG_FILE, RunDirectory, default_name
+from common.files import RUN_CONFIG
+from services.train.rundir import RunDirectory, default_name
 
 CONFIG = load_config("smoke", {"arena.num_robots": "3"}, {})
 
@@ -19,13 +20,13 @@ def path(tmp_path: Path) -> Path:
 
 def test_a_new_folder_holds_the_resolved_configuration(path: Path) -> None:
     with RunDirectory.create(path, CONFIG) as run:
-        assert load_config(str(path / CONFIG_FILE), environ={}) == run.config == CONFIG
+        assert load_config(str(path / RUN_CONFIG), environ={}) == run.config == CONFIG
         assert run.logs.is_dir()
         assert not run.resumed
         run.note_endpoint("tcp/127.0.0.1:7")
         assert (path / "endpoint").read_text() == "tcp/127.0.0.1:7"
     assert not (path / "endpoint").exists()
-    assert {entry.name for entry in path.iterdir()} == {CONFIG_FILE, "logs"}
+    assert {entry.name for entry in path.iterdir()} == {RUN_CONFIG, "logs"}
 
 
 def test_a_folder_that_exists_is_no_new_run(path: Path) -> None:
@@ -44,7 +45,7 @@ def test_a_run_is_resumed_with_what_the_flags_change(path: Path) -> None:
         assert run.resumed
         assert run.config.run.minutes == 7
         assert run.config.arena.num_robots == 3
-    assert load_config(str(path / CONFIG_FILE), environ={}).run.minutes == 7
+    assert load_config(str(path / RUN_CONFIG), environ={}).run.minutes == 7
 
 
 @pytest.mark.parametrize("made", [False, True])
@@ -57,7 +58,7 @@ def test_what_holds_no_run_is_not_resumed(path: Path, made: bool) -> None:
 
 def test_a_run_whose_configuration_is_broken_is_not_resumed(path: Path) -> None:
     RunDirectory.create(path, CONFIG).close()
-    (path / CONFIG_FILE).write_text("[learners]\n")
+    (path / RUN_CONFIG).write_text("[learners]\n")
     with pytest.raises(ConfigError, match="did you mean learner"):
         RunDirectory.resume(path, {})
 
