@@ -10,7 +10,8 @@ import difflib
 import json
 import os
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
@@ -462,32 +463,61 @@ def load_config(
 
     Raises ConfigError, one line, naming the setting, what is wrong and what is right.
     """
-    table: dict[str, Any] = {}
-    if source is not None:
-        table = _read_toml(source)
+    table = {} if source is None else _read_toml(source)
+    return apply_overrides(table, overrides or {}, environ)
+
+
+def load_transport(
+    overrides: Mapping[str, str], environ: Mapping[str, str] | None = None
+) -> TransportConfig:
+    """How to reach a run whose other settings are not known yet; arguments as of load_config.
+
+    Raises ConfigError as load_config.
+    """
+    table = _overridden({}, overrides, environ)
+    with _one_line("transport"):
+        return TransportConfig.model_validate(table.get("transport", {}))
+
+
+def _overridden(
+    table: dict[str, Any], overrides: Mapping[str, str], environ: Mapping[str, str] | None
+) -> dict[str, Any]:
+    """The table with the environment's settings, and the flags' above them."""
     env = environment_overrides(os.environ if environ is None else environ)
     for dotted, text in env.items():
         _merge_text(table, dotted, text, "environment")
-    for dotted, text in (overrides or {}).items():
-        _merge_text(table, dotted, text, "flag")
-    return validate_config(table)
-
-
-def apply_overrides(config: Config, overrides: Mapping[str, str]) -> Config:
-    """The configuration with "section.field" set to text, checked as a whole again."""
-    table = config.model_dump()
     for dotted, text in overrides.items():
         _merge_text(table, dotted, text, "flag")
-    return validate_config(table)
+    return table
+
+
+def apply_overrides(
+    table: dict[str, Any], overrides: Mapping[str, str], environ: Mapping[str, str] | None = None
+) -> Config:
+    """The configuration of a table, under the environment's settings and the flags'.
+
+    Arguments and errors as of load_config.
+    """
+    return validate_config(_overridden(table, overrides, environ))
 
 
 def validate_config(table: Mapping[str, Any]) -> Config:
     """A Config from its table; raises ConfigError naming the first setting that is wrong."""
-    try:
+    with _one_line():
         return Config.model_validate(table)
+
+
+@contextmanager
+def _one_line(*above: str) -> Iterator[None]:
+    """A ValidationError as a ConfigError that names the first setting that is wrong.
+
+    above: what its name begins with.
+    """
+    try:
+        yield
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "configuration"
+        where = ".".join(map(str, (*above, *first["loc"]))) or "configuration"
         message = first["msg"].removeprefix("Value error, ")
         given = first.get("input")
         shown = "" if isinstance(given, (dict, BaseModel)) else f" (given {given!r})"

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 
 from common.arguments import Parser, add_config_flags, overrides
-from common.config import Config, TransportConfig, apply_overrides, load_config, validate_config
+from common.config import Config, TransportConfig, apply_overrides, load_transport
 from common.errors import DeadlineError, EndpointError, MrcdrlError, TransportError
 from common.keys import Keys, check_name
 from common.trajectory import Stats
@@ -115,26 +115,29 @@ def joining_arguments(role: str, argv: Sequence[str]) -> Joining:
     run_dir = arguments.run_dir / check_name(arguments.run, "run name")
     worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", f"{socket.gethostname()}-{os.getpid()}")
     given = overrides(arguments)
-    transport = load_config(
-        None, {k: v for k, v in given.items() if k.startswith("transport.")}
-    ).transport
-    endpoints = tuple(arguments.connect or transport.connect or [_noted_endpoint(run_dir)])
+    transport = load_transport(given)
+    endpoints = tuple(
+        arguments.connect or transport.connect or [noted_endpoint(run_dir, "--connect")]
+    )
     transport = transport.model_copy(update={"connect": endpoints, "listen": ()})
     return Joining(arguments.run, check_name(worker, "--id"), run_dir, transport, given)
 
 
-def _noted_endpoint(run_dir: Path) -> str:
-    """Where the run on this machine listens, as `mrcdrl train` wrote it down."""
+def noted_endpoint(run_dir: Path, flag: str) -> str:
+    """Where the run on this machine listens, as `mrcdrl train` wrote it down.
+
+    Raises EndpointError, naming the flag to give, where none is up.
+    """
     try:
         return (run_dir / ENDPOINT_FILE).read_text("utf-8").strip()
     except OSError as error:
         raise EndpointError(
-            f"no run is up in {run_dir}; give --connect, such as tcp/127.0.0.1:7447"
+            f"no run is up in {run_dir}; give {flag}, such as tcp/127.0.0.1:7447"
         ) from error
 
 
 def fetch_config(session: Session, joining: Joining, stop: StopSignal) -> Config:
-    """The run's configuration, from its replay service, under this process's own flags.
+    """The run's configuration, from its replay service, under this process's own settings.
 
     Raises DeadlineError where nobody serves that run for 30 s.
     """
@@ -149,7 +152,7 @@ def fetch_config(session: Session, joining: Joining, stop: StopSignal) -> Config
                 raise DeadlineError(f"{error}; is that the run's name?") from error
             continue
         table = {**tomllib.loads(text), "transport": joining.transport.model_dump()}
-        return apply_overrides(validate_config(table), joining.overrides)
+        return apply_overrides(table, joining.overrides)
 
 
 def available_cores() -> int:

@@ -9,8 +9,15 @@ import numpy as np
 
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, ReplayConfig, load_config, to_toml
+from common.files import RUN_CONFIG
 from common.keys import Keys, check_name
-from common.process import STOP_DEADLINE_S, StatsReporter, StopSignal, run_main
+from common.process import (
+    STOP_DEADLINE_S,
+    StatsReporter,
+    StopSignal,
+    noted_endpoint,
+    run_main,
+)
 from common.transport import Session
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
@@ -26,25 +33,25 @@ def main(argv: Sequence[str]) -> int:
     """Serve a run's replay; the exit code."""
     parser = Parser(prog="mrcdrl replay", description="Serve the replay table of a run.")
     parser.add_argument("--run", required=True, help="the run's name")
-    parser.add_argument("--config", help="a preset or a TOML file")
+    parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
     parser.add_argument("--listen", action="append", help="endpoint, such as tcp/127.0.0.1:7447")
     parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
     parser.add_argument("--id", default="replay-0", help="this worker's name")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
-    config = load_config(arguments.config, overrides(arguments))
-    transport = config.transport.model_copy(
-        update={
-            "listen": tuple(arguments.listen or config.transport.listen),
-            "connect": tuple(arguments.connect or config.transport.connect),
-        }
-    )
+    run_dir = arguments.run_dir / check_name(arguments.run, "run name")
+    config = load_config(arguments.config or config_of(run_dir), overrides(arguments))
+    listen = tuple(arguments.listen or config.transport.listen)
+    connect = tuple(arguments.connect or config.transport.connect)
+    if not (listen or connect):
+        listen = (noted_endpoint(run_dir, "--listen"),)
+    transport = config.transport.model_copy(update={"listen": listen, "connect": connect})
     keys = Keys(arguments.run)
     worker = check_name(arguments.id, "--id")
     stop = StopSignal().listen(STOP_DEADLINE_S)
     table, limiter = build(config)
-    log = open_log(config, arguments.run_dir / arguments.run / "replay" / "0")
+    log = open_log(config, run_dir / "replay" / "0")
     with Session(transport) as session:
         configs = session.server(keys.config)
         inserts, samples = session.server(keys.insert()), session.server(keys.sample())
@@ -67,6 +74,12 @@ def main(argv: Sequence[str]) -> int:
             if log is not None:
                 log.close()
     return 0 if stop.is_set() else 1
+
+
+def config_of(run_dir: Path) -> str | None:
+    """The file that the run was made with, if it has a folder."""
+    path = run_dir / RUN_CONFIG
+    return str(path) if path.is_file() else None
 
 
 def open_log(config: Config, directory: Path) -> SegmentLog | None:

@@ -46,7 +46,8 @@ def main(argv: Sequence[str]) -> int:
     """Train; the exit code."""
     with open_run(argv) as run:
         stop = StopSignal().listen()
-        _LOG.info("run %s: %s", run.path, expectation(run.config))
+        taken_up = " taken up again" if run.resumed else ""
+        _LOG.info("run %s%s: %s", run.path, taken_up, expectation(run.config))
         endpoint = (run.config.transport.listen or (free_endpoint(),))[0]
         fleet = Fleet(run.logs)
         try:
@@ -189,8 +190,28 @@ def display(
 
         yield print_line
         return
-    with Live(console=console, screen=True, auto_refresh=False) as live:
+    with logging_to(state), Live(console=console, screen=True, auto_refresh=False) as live:
         yield lambda: live.update(screen(state, config, clock(), name), refresh=True)
+
+
+@contextmanager
+def logging_to(state: RunState) -> Iterator[None]:
+    """The launcher's own log lines go into the state: written over a screen they would spoil it."""
+    root = logging.getLogger()
+    streams, root.handlers = root.handlers, [_StateHandler(state)]
+    try:
+        yield
+    finally:
+        root.handlers = streams
+
+
+class _StateHandler(logging.Handler):
+    def __init__(self, state: RunState) -> None:
+        super().__init__()
+        self._state = state
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._state.observe_log(record.getMessage())
 
 
 def draw(run_dir: Path) -> None:

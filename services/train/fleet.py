@@ -95,7 +95,10 @@ class Fleet:
             if code == 0:
                 if service.role == "learner":
                     return "the learner has done its steps"
-                _LOG.info("%s was stopped", service.worker)
+                _LOG.warning(
+                    "%s was stopped by hand; mrcdrl %s --run %s --id %s starts one again",
+                    *(service.worker, service.role, self._logs.parent.name, service.worker),
+                )
             elif lived_s < _MIN_LIFE_S or service.restarts == _MAX_RESTARTS:
                 raise MrcdrlError(
                     f"{service.worker} failed: {service.last_line()} (log: {service.log_path})"

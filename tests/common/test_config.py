@@ -15,6 +15,7 @@ from common.config import (
     LearnerConfig,
     apply_overrides,
     load_config,
+    load_transport,
     preset_names,
     sections,
     to_toml,
@@ -132,7 +133,7 @@ def test_a_file_extends_a_preset_field_by_field(write: Any) -> None:
     config, smoke = load(source), load("smoke")
     assert config.replay.capacity == 3000
     assert config.replay.min_size == smoke.replay.min_size
-    assert config == apply_overrides(smoke, {"replay.capacity": "3000"})
+    assert config == apply_overrides(smoke.model_dump(), {"replay.capacity": "3000"})
 
 
 def test_a_file_extends_a_file(write: Any) -> None:
@@ -181,10 +182,10 @@ def test_the_impossible_is_refused_with_its_consequence(case: str) -> None:
 
 
 def test_overrides_of_a_configuration_are_checked_as_a_whole() -> None:
-    smaller = apply_overrides(Config(), {"replay.min_size": "64"})
+    smaller = apply_overrides(Config().model_dump(), {"replay.min_size": "64"})
     assert smaller.replay.min_size == 64
     with pytest.raises(ConfigError, match="first batch would repeat"):
-        apply_overrides(smaller, {"learner.batch_size": "65"})
+        apply_overrides(smaller.model_dump(), {"learner.batch_size": "65"})
 
 
 def test_a_configuration_is_frozen() -> None:
@@ -289,3 +290,22 @@ def test_the_other_presets_sample_uniformly(preset: str) -> None:
 def test_the_length_of_a_record_follows_from_the_codec() -> None:
     assert load(None, {"arena.codec": "frames"}).arena.record_bytes == 3600
     assert load(None, {"arena.num_robots": "4"}).arena.record_bytes == 80
+
+
+def test_the_way_to_a_run_is_known_before_its_other_settings() -> None:
+    given = {"transport.timeout_s": "2", "learner.batch_size": "64"}
+    assert load_transport(given, environ={}).timeout_s == 2
+    with pytest.raises(ConfigError, match="not below"):
+        load_config(None, given, environ={})
+
+
+def test_a_wrong_way_to_a_run_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"transport\.timeout_s: .*greater than 0"):
+        load_transport({"transport.timeout_s": "-1"}, environ={})
+
+
+def test_the_environment_counts_in_a_service_that_joins() -> None:
+    table = Config().model_dump()
+    environ = {"MRCDRL_LEARNER__THREADS": "3", "MRCDRL_LEARNER__SEED": "4"}
+    joined = apply_overrides(table, {"learner.seed": "5"}, environ)
+    assert (joined.learner.threads, joined.learner.seed) == (3, 5)
