@@ -2,8 +2,10 @@
 
 A message is one msgpack map: its fields by name, and `schema`, the message's name and version.
 A number array is a pair [shape, bytes], C order, little-endian, of the dtype that
-`common/trajectory.py` declares. Invariants: what `decode` returns has exactly the declared
-types, dtypes and mutually fitting shapes; any other bytes raise WireError with the reason.
+`common/trajectory.py` declares; a large one follows the map (`common/framing.py`), and the pair is
+[shape, place among what follows]. Invariants: what `decode` returns has exactly the declared
+types, dtypes and mutually fitting shapes; any other bytes raise WireError with the reason; large
+arrays are copied neither way.
 """
 
 import enum
@@ -17,6 +19,7 @@ import msgpack
 import numpy as np
 
 from common.errors import WireError
+from common.framing import Part, join_map, padded, split_map
 from common.trajectory import (
     NUM_ACTIONS,
     Chunk,
@@ -33,6 +36,7 @@ from common.trajectory import (
 
 M = TypeVar("M")
 _MAX_NDIM = 8
+_LARGE_BYTES = 8192  # of an array that follows the map
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,24 +124,36 @@ _CHECKS: dict[type, Callable[[Any], str | None]] = {
 
 def encode(message: Any) -> bytes:
     """The bytes of any message of the schema."""
+    return b"".join(encode_parts(message))
+
+
+def encode_parts(message: Any) -> list[Part]:
+    """The same bytes in parts; large arrays are views of the message's memory, in order."""
     table: dict[str, Any] = {"schema": _SCHEMAS[type(message)]}
+    large: list[memoryview] = []
+    place = 0
     for field in fields(message):
         value = getattr(message, field.name)
         if isinstance(value, np.ndarray):
-            little = value.astype(value.dtype.newbyteorder("<"), copy=False)
-            value = [list(value.shape), little.tobytes()]
+            little = value.astype(value.dtype.newbyteorder("<"), order="C", copy=False)
+            if little.nbytes < _LARGE_BYTES:
+                value = [list(value.shape), little.tobytes()]
+            else:
+                value = [list(value.shape), place]
+                large.append(memoryview(little.reshape(-1).view(np.uint8)))
+                place += padded(little.nbytes)
         table[field.name] = value
-    packed: bytes = msgpack.packb(table)
-    return packed
+    return join_map(msgpack.packb(table), large)
 
 
-def decode(cls: type[M], data: bytes) -> M:
+def decode(cls: type[M], data: Part) -> M:
     """The message of class `cls` that `data` holds; its arrays are read-only views of `data`.
 
     Raises WireError, with the reason, for whatever `encode` would not have written.
     """
+    packed, arrays = split_map(memoryview(data).toreadonly())
     try:
-        table = msgpack.unpackb(data, raw=False, strict_map_key=True, use_list=True)
+        table = msgpack.unpackb(packed, raw=False, strict_map_key=True, use_list=True)
     except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
         raise WireError(f"no msgpack: {type(error).__name__}") from error
     if not isinstance(table, dict):
@@ -150,17 +166,37 @@ def decode(cls: type[M], data: bytes) -> M:
     if table.keys() != readers.keys():
         odd = sorted(map(str, table.keys() ^ readers.keys()))
         raise WireError(f"missing or unknown fields: {', '.join(odd)[:120]}")
-    values = {}
+    values, end = {}, 0
     for name, read in readers.items():
+        value = table[name]
+        is_large = _follows(value)
         try:
-            values[name] = read(table[name])
+            if is_large:
+                value = [value[0], _begin(arrays, value[1], padded(end))]
+            values[name] = read(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise WireError(f"{name}: {error}") from error
+        if is_large:
+            end = padded(end) + values[name].nbytes
+    if end != len(arrays):
+        raise WireError(f"{len(arrays)} bytes after the map, of which {end} are arrays")
     message = cls(**values)
     check = _CHECKS.get(cls)
     if check is not None and (reason := check(message)) is not None:
         raise WireError(reason)
     return message
+
+
+def _follows(value: Any) -> bool:
+    """Whether this is the pair of an array after the map."""
+    return isinstance(value, list) and len(value) == 2 and type(value[1]) is int
+
+
+def _begin(arrays: memoryview, place: int, due: int) -> memoryview:
+    """What begins at a place; ValueError unless it is where the next array is due."""
+    if place != due:
+        raise ValueError(f"an array at {place} where {due} is due")
+    return arrays[place:]
 
 
 def _readers_of(cls: type) -> dict[str, Callable[[Any], Any]]:
@@ -194,11 +230,14 @@ def _array_reader(dtype: np.dtype[Any]) -> Callable[[Any], Any]:
         if not (isinstance(value, list) and len(value) == 2):
             raise TypeError("no pair [shape, bytes]")
         shape, data = value
-        if not isinstance(data, bytes) or not isinstance(shape, list) or len(shape) > _MAX_NDIM:
+        if not isinstance(data, Part) or not isinstance(shape, list) or len(shape) > _MAX_NDIM:
             raise TypeError("no pair [shape, bytes]")
         if any(type(n) is not int or n < 0 for n in shape):
             raise ValueError("a length in the shape is no natural number")
-        if math.prod(shape) * dtype.itemsize != len(data):
+        length = math.prod(shape) * dtype.itemsize
+        if isinstance(data, memoryview) and length <= len(data):
+            data = data[:length]
+        if length != len(data):
             raise ValueError(f"shape {shape} of {dtype} does not fit {len(data)} bytes")
         little = np.frombuffer(data, dtype.newbyteorder("<")).reshape(shape)
         return little.astype(dtype, copy=False)

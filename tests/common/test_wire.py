@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 from typing import Any
+from unittest import mock
 
 import msgpack
 import numpy as np
@@ -11,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from common import wire
 from common.errors import WireError
+from common.framing import join_map, join_set, split_map, split_set
 from common.trajectory import (
     Chunk,
     EpisodeSummary,
@@ -24,7 +27,7 @@ from common.trajectory import (
     Stats,
     Weights,
 )
-from common.wire import SampleRequest, decode, encode
+from common.wire import SampleRequest, decode, encode, encode_parts
 
 INTS = st.integers(-(2**63), 2**63 - 1)
 COUNTS = st.integers(0, 2**63 - 1)
@@ -162,9 +165,14 @@ def assert_same(found: Any, expected: Any) -> None:
             assert ours == theirs, field.name
 
 
-@given(MESSAGES)
-def test_every_message_comes_back_as_it_was(message: Any) -> None:
-    assert_same(decode(type(message), encode(message)), message)
+LARGE_FROM = st.sampled_from([0, 8192])  # bytes: all arrays follow the map, or none so small
+
+
+@given(MESSAGES, LARGE_FROM)
+def test_every_message_comes_back_as_it_was(message: Any, large_from: int) -> None:
+    with mock.patch.object(wire, "_LARGE_BYTES", large_from):
+        data = encode(message)
+    assert_same(decode(type(message), data), message)
 
 
 def test_an_array_that_is_not_contiguous_comes_back_as_it_was() -> None:
@@ -318,6 +326,90 @@ MALFORMED = {
 }
 
 
+LARGE = dataclasses.replace(
+    CHUNK,
+    records=np.arange(5 * 2000, dtype=np.uint16).astype(np.uint8).reshape(5, 2000),
+    actions=np.zeros(2, np.uint8),
+)
+_PLACES = encode(LARGE)
+
+
+def _other_place(place: int) -> bytes:
+    """LARGE with its records said to lie elsewhere."""
+    packed = changed_map(LARGE, records=[[5, 2000], place])
+    return b"".join(join_map(packed, [memoryview(LARGE.records.reshape(-1))]))
+
+
+def changed_map(message: Any, **fields: Any) -> bytes:
+    packed, _ = split_map(memoryview(encode(message)))
+    replaced: bytes = msgpack.packb({**msgpack.unpackb(packed), **fields})
+    return replaced
+
+
+MALFORMED |= {
+    "head alone": (Chunk, _PLACES[:6], "ends in its head"),
+    "map cut off": (Chunk, _PLACES[:100], "in a message of 100"),
+    "arrays cut off": (Chunk, _PLACES[:-1], r"\[5, 2000\] of uint8 does not fit 9999 bytes"),
+    "bytes after the arrays": (Chunk, _PLACES + b"x", "10001 bytes after the map, of which 10000"),
+    "map without its arrays": (Chunk, changed_map(LARGE), "does not fit 0 bytes"),
+    "arrays of nobody": (
+        Chunk,
+        b"".join(join_map(encode(CHUNK), [memoryview(bytes(9000))])),
+        "9000 bytes after the map, of which 0",
+    ),
+    "another place": (Chunk, _other_place(64), "an array at 64 where 0 is due"),
+    "negative place": (Chunk, _other_place(-64), "an array at -64 where 0 is due"),
+    "a place for a name": (Chunk, changed(CHUNK, actor=["a", 0]), "actor: no str"),
+}
+
+
+def test_large_arrays_are_neither_copied_nor_writeable() -> None:
+    parts = encode_parts(LARGE)
+    assert any(np.shares_memory(np.frombuffer(part, np.uint8), LARGE.records) for part in parts)
+    data = bytearray(b"".join(parts))
+    found = decode(Chunk, memoryview(data))
+    assert_same(found, LARGE)
+    assert np.shares_memory(found.records, np.frombuffer(data, np.uint8))
+    assert not found.records.flags.writeable
+    offset = found.records.__array_interface__["data"][0] - address(data)
+    assert offset % 64 == 0
+
+
+def address(data: bytearray) -> int:
+    place: int = np.frombuffer(data, np.uint8).__array_interface__["data"][0]
+    return place
+
+
+@given(st.lists(MESSAGES, min_size=1, max_size=5))
+def test_messages_that_travel_together_come_apart_again(messages: list[Any]) -> None:
+    data = b"".join(join_set([encode_parts(message) for message in messages]))
+    for message, found in zip(messages, split_set(data), strict=True):
+        assert_same(decode(type(message), found), message)
+
+
+SETS = {
+    "head alone": (b"\xc1set\x02", "ends in its head"),
+    "lengths cut off": (b"\xc1set\x02\0\0\0\x01\0\0\0", "ends in its head"),
+    "none": (b"\xc1set\0\0\0\0", "a set of 0 messages"),
+    "too many": (b"\xc1set\xff\xff\xff\xff", "a set of 4294967295 messages"),
+    "cut off": (b"".join(join_set([[b"a"], [b"b"]]))[:-1], "bytes whose messages have"),
+    "too long": (b"".join(join_set([[b"a"], [b"b"]])) + b"c", "bytes whose messages have"),
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_malformed_set_is_refused_with_its_reason(name: str) -> None:
+    data, reason = SETS[name]
+    with pytest.raises(WireError, match=reason):
+        split_set(data)
+
+
+@given(st.binary(max_size=200))
+def test_a_random_set_raises_nothing_else(data: bytes) -> None:
+    with contextlib.suppress(WireError):
+        assert sum(map(len, split_set(b"\xc1set" + data))) <= len(data)
+
+
 @pytest.mark.parametrize("name", MALFORMED)
 def test_the_malformed_is_refused_with_its_reason(name: str) -> None:
     cls, data, reason = MALFORMED[name]
@@ -361,9 +453,10 @@ def test_a_field_of_any_other_kind_is_taken_wholly_or_refused(message: Any, data
     assert type(getattr(found, name)) is type(getattr(message, name))
 
 
-@given(message=MESSAGES, data=st.data())
-def test_a_damaged_byte_raises_nothing_else(message: Any, data: Any) -> None:
-    damaged = bytearray(encode(message))
+@given(message=MESSAGES, large_from=LARGE_FROM, data=st.data())
+def test_a_damaged_byte_raises_nothing_else(message: Any, large_from: int, data: Any) -> None:
+    with mock.patch.object(wire, "_LARGE_BYTES", large_from):
+        damaged = bytearray(encode(message))
     place = data.draw(st.integers(0, len(damaged) - 1))
     damaged[place] ^= data.draw(st.integers(1, 255))
     with contextlib.suppress(WireError):
