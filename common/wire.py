@@ -140,7 +140,7 @@ def encode_parts(message: Any) -> list[Part]:
                 value = [list(value.shape), little.tobytes()]
             else:
                 value = [list(value.shape), place]
-                large.append(memoryview(little.reshape(-1).view(np.uint8)))
+                large.append(little.reshape(-1).view(np.uint8).data)
                 place += padded(little.nbytes)
         table[field.name] = value
     return join_map(msgpack.packb(table), large)

@@ -7,21 +7,19 @@ declared. What Zenoh loses and when: docs/wire.md.
 
 import contextlib
 import json
-import queue
 import re
 import socket
-import threading
 import time
-from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Self
 
 import zenoh
 
 from common.config import TransportConfig
-from common.errors import DeadlineError, EndpointError, HeldError, RefusedError, TransportError
+from common.errors import EndpointError
+from common.transport.publications import LatestSubscriber, Presence, Publisher, QueueSubscriber
+from common.transport.queries import Client, Server
 
-_HELD = "held: "
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _OPEN_ATTEMPT_MS = 2_000
 
@@ -56,35 +54,35 @@ class Session:
         if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def publisher(self, key: str) -> "Publisher":
+    def publisher(self, key: str) -> Publisher:
         """A publisher whose `put` waits rather than drops when the link is full."""
         declared = self._session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.BLOCK
         )
         return Publisher(self._declare(declared))
 
-    def latest_subscriber(self, key: str) -> "LatestSubscriber":
+    def latest_subscriber(self, key: str) -> LatestSubscriber:
         """Keeps the newest publication only: older ones are overwritten."""
         latest = LatestSubscriber(self._config.max_message_bytes)
         handler = zenoh.handlers.Callback(latest.offer, indirect=False)
         self._declare(self._session.declare_subscriber(key, handler))
         return latest
 
-    def queue_subscriber(self, key: str, capacity: int = 4096) -> "QueueSubscriber":
+    def queue_subscriber(self, key: str, capacity: int = 4096) -> QueueSubscriber:
         """Keeps publications in order; when full, new ones are dropped and counted."""
         waiting = QueueSubscriber(self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(waiting.offer, indirect=False)
         self._declare(self._session.declare_subscriber(key, handler))
         return waiting
 
-    def server(self, key: str, capacity: int = 256) -> "Server":
+    def server(self, key: str, capacity: int = 256) -> Server:
         """Answers queries on `key`; when `capacity` wait already, a new one is refused."""
         server = Server(self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(server.offer, indirect=False)
         self._declare(self._session.declare_queryable(key, handler, complete=True))
         return server
 
-    def client(self, key: str, whom: str, timeout_s: float | None = None) -> "Client":
+    def client(self, key: str, whom: str, timeout_s: float | None = None) -> Client:
         """Asks the queryable on `key`; `whom` names it in errors."""
         timeout = self._config.timeout_s if timeout_s is None else timeout_s
         querier = self._session.declare_querier(
@@ -114,225 +112,6 @@ class Session:
         ends = self._config.listen or self._config.connect
         state = "closed" if self._session.is_closed() else "open"
         return f"<Session {', '.join(ends)} {state}>"
-
-
-class Publisher:
-    """Puts bytes on one key."""
-
-    def __init__(self, publisher: Any) -> None:
-        self._publisher = publisher
-
-    def put(self, payload: bytes) -> None:
-        """Publish; what nobody subscribes to is lost without an error."""
-        try:
-            self._publisher.put(payload)
-        except zenoh.ZError as error:
-            raise TransportError(f"cannot publish: {error}") from error
-
-
-class LatestSubscriber:
-    """The newest publication, for one reading thread."""
-
-    def __init__(self, max_message_bytes: int) -> None:
-        self._max_bytes = max_message_bytes
-        self._changed = threading.Condition()
-        self._newest: bytes | None = None
-        self.oversized = 0
-
-    def offer(self, sample: Any) -> None:
-        """For Zenoh's callback."""
-        if len(sample.payload) > self._max_bytes:
-            self.oversized += 1
-            return
-        payload = sample.payload.to_bytes()
-        with self._changed:
-            self._newest = payload
-            self._changed.notify_all()
-
-    def take(self, timeout_s: float = 0.0) -> bytes | None:
-        """The newest not taken yet; None where none came within `timeout_s`."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None, timeout_s)
-            newest, self._newest = self._newest, None
-            return newest
-
-
-class QueueSubscriber:
-    """Publications in the order of their arrival, for one reading thread."""
-
-    def __init__(self, max_message_bytes: int, capacity: int) -> None:
-        self._max_bytes = max_message_bytes
-        self._waiting: queue.Queue[tuple[str, bytes]] = queue.Queue(capacity)
-        self.dropped = 0
-
-    def offer(self, sample: Any) -> None:
-        """For Zenoh's callback."""
-        try:
-            if len(sample.payload) > self._max_bytes:
-                raise queue.Full
-            self._waiting.put_nowait((str(sample.key_expr), sample.payload.to_bytes()))
-        except queue.Full:
-            self.dropped += 1
-
-    def take(self, timeout_s: float) -> tuple[str, bytes] | None:
-        """The next (key, payload); None where none came within `timeout_s`."""
-        try:
-            if timeout_s <= 0:
-                return self._waiting.get_nowait()
-            return self._waiting.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-
-    def drain(self) -> Iterator[tuple[str, bytes]]:
-        """Everything that waits now."""
-        while (item := self.take(0.0)) is not None:
-            yield item
-
-
-class Request:
-    """A query to be answered once, by `reply`, `refuse` or `hold`."""
-
-    __slots__ = ("_query", "arrived_s", "payload")
-
-    def __init__(self, query: Any, payload: bytes) -> None:
-        self._query = query
-        self.payload = payload
-        self.arrived_s = time.monotonic()
-
-    def reply(self, payload: bytes) -> None:
-        self._answer(lambda: self._query.reply(self._query.key_expr, payload))
-
-    def refuse(self, reason: str) -> None:
-        """The peer's request is wrong; asking again would not help."""
-        self._answer(lambda: self._query.reply_err(reason.encode()))
-
-    def hold(self, reason: str) -> None:
-        """Not now; the peer is to ask again."""
-        self._answer(lambda: self._query.reply_err((_HELD + reason).encode()))
-
-    def _answer(self, answer: Callable[[], None]) -> None:
-        # A peer that is gone by now asks again when it is back: nothing to report here.
-        with contextlib.suppress(zenoh.ZError):
-            answer()
-        self._query.drop()
-
-
-class Server:
-    """Requests in the order of their arrival, for one or more serving threads."""
-
-    def __init__(self, max_message_bytes: int, capacity: int) -> None:
-        self._max_bytes = max_message_bytes
-        self._waiting: queue.Queue[Request] = queue.Queue(capacity)
-        self.refused = 0
-
-    def offer(self, query: Any) -> None:
-        """For Zenoh's callback."""
-        size = 0 if query.payload is None else len(query.payload)
-        if size > self._max_bytes:
-            self.refused += 1
-            Request(query, b"").refuse(f"{size} bytes exceed the limit of {self._max_bytes}")
-            return
-        request = Request(query, b"" if query.payload is None else query.payload.to_bytes())
-        try:
-            self._waiting.put_nowait(request)
-        except queue.Full:
-            self.refused += 1
-            request.hold(f"{self._waiting.maxsize} requests are waiting")
-
-    def take(self, timeout_s: float) -> Request | None:
-        """The next request; None where none came within `timeout_s`."""
-        try:
-            return self._waiting.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
-
-
-class PendingReply:
-    """The reply to one query that is under way."""
-
-    def __init__(self, whom: str, timeout_s: float, max_message_bytes: int) -> None:
-        self._whom = whom
-        self._deadline = time.monotonic() + timeout_s
-        self._max_bytes = max_message_bytes
-        self._replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.offer = self._replies.put
-
-    def end(self) -> None:
-        """For Zenoh's callback: no further reply will come."""
-        self._replies.put(None)
-
-    def result(self) -> bytes:
-        """The reply's payload.
-
-        Raises HeldError or RefusedError for a refusal, DeadlineError where no reply came.
-        """
-        # Zenoh ends the query at its own timeout; the second more is for a callback that is late.
-        left = self._deadline + 1.0 - time.monotonic()
-        try:
-            reply = self._replies.get(timeout=max(left, 0.0))
-        except queue.Empty:
-            reply = None
-        if reply is None:
-            raise DeadlineError(f"no answer from {self._whom}")
-        if reply.ok is not None:
-            if len(reply.ok.payload) > self._max_bytes:
-                raise RefusedError(f"the answer of {self._whom} exceeds {self._max_bytes} bytes")
-            payload: bytes = reply.ok.payload.to_bytes()
-            return payload
-        text = reply.err.payload.to_bytes().decode("utf-8", "replace")
-        if text.startswith(_HELD):
-            raise HeldError(text.removeprefix(_HELD))
-        if text == "Timeout":
-            raise DeadlineError(f"no answer from {self._whom} in time")
-        raise RefusedError(f"{self._whom} refused: {text}")
-
-
-class Client:
-    """Sends queries to one key; any number may be under way."""
-
-    def __init__(self, querier: Any, whom: str, timeout_s: float, max_message_bytes: int) -> None:
-        self._querier = querier
-        self._whom = whom
-        self._timeout_s = timeout_s
-        self._max_bytes = max_message_bytes
-
-    def ask(self, payload: bytes) -> PendingReply:
-        """Send a query; its answer is waited for with `PendingReply.result`."""
-        pending = PendingReply(self._whom, self._timeout_s, self._max_bytes)
-        handler = zenoh.handlers.Callback(pending.offer, pending.end, indirect=False)
-        try:
-            self._querier.get(handler, payload=payload)
-        except zenoh.ZError as error:
-            raise TransportError(f"cannot ask {self._whom}: {error}") from error
-        return pending
-
-
-class Presence:
-    """Who holds a liveliness token now."""
-
-    def __init__(self) -> None:
-        self._changes: queue.SimpleQueue[tuple[str, bool]] = queue.SimpleQueue()
-        self._alive: set[str] = set()
-
-    def offer(self, sample: Any) -> None:
-        """For Zenoh's callback."""
-        self._changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-
-    def changes(self) -> Iterator[tuple[str, bool]]:
-        """(key, alive) of what changed since the last call, in order."""
-        while True:
-            try:
-                key, alive = self._changes.get_nowait()
-            except queue.Empty:
-                return
-            (self._alive.add if alive else self._alive.discard)(key)
-            yield key, alive
-
-    def alive(self) -> frozenset[str]:
-        """The keys of all tokens now held."""
-        for _ in self.changes():
-            pass
-        return frozenset(self._alive)
 
 
 def free_endpoint() -> str:

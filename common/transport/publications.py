@@ -1,0 +1,115 @@
+"""What is published and followed without an answer: messages, the newest message, who is there.
+
+Invariants: Zenoh's callbacks only enqueue; each object is read by one thread; every queue says
+what happens when it is full.
+"""
+
+import queue
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import zenoh
+
+from common.errors import TransportError
+
+
+class Publisher:
+    """Puts bytes on one key."""
+
+    def __init__(self, publisher: Any) -> None:
+        self._publisher = publisher
+
+    def put(self, payload: bytes) -> None:
+        """Publish; what nobody subscribes to is lost without an error."""
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError as error:
+            raise TransportError(f"cannot publish: {error}") from error
+
+
+class LatestSubscriber:
+    """The newest publication, for one reading thread."""
+
+    def __init__(self, max_message_bytes: int) -> None:
+        self._max_bytes = max_message_bytes
+        self._changed = threading.Condition()
+        self._newest: bytes | None = None
+        self.oversized = 0
+
+    def offer(self, sample: Any) -> None:
+        """For Zenoh's callback."""
+        if len(sample.payload) > self._max_bytes:
+            self.oversized += 1
+            return
+        payload = sample.payload.to_bytes()
+        with self._changed:
+            self._newest = payload
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float = 0.0) -> bytes | None:
+        """The newest not taken yet; None where none came within `timeout_s`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._newest is not None, timeout_s)
+            newest, self._newest = self._newest, None
+            return newest
+
+
+class QueueSubscriber:
+    """Publications in the order of their arrival, for one reading thread."""
+
+    def __init__(self, max_message_bytes: int, capacity: int) -> None:
+        self._max_bytes = max_message_bytes
+        self._waiting: queue.Queue[tuple[str, bytes]] = queue.Queue(capacity)
+        self.dropped = 0
+
+    def offer(self, sample: Any) -> None:
+        """For Zenoh's callback."""
+        try:
+            if len(sample.payload) > self._max_bytes:
+                raise queue.Full
+            self._waiting.put_nowait((str(sample.key_expr), sample.payload.to_bytes()))
+        except queue.Full:
+            self.dropped += 1
+
+    def take(self, timeout_s: float) -> tuple[str, bytes] | None:
+        """The next (key, payload); None where none came within `timeout_s`."""
+        try:
+            if timeout_s <= 0:
+                return self._waiting.get_nowait()
+            return self._waiting.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def drain(self) -> Iterator[tuple[str, bytes]]:
+        """Everything that waits now."""
+        while (item := self.take(0.0)) is not None:
+            yield item
+
+
+class Presence:
+    """Who holds a liveliness token now."""
+
+    def __init__(self) -> None:
+        self._changes: queue.SimpleQueue[tuple[str, bool]] = queue.SimpleQueue()
+        self._alive: set[str] = set()
+
+    def offer(self, sample: Any) -> None:
+        """For Zenoh's callback."""
+        self._changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+
+    def changes(self) -> Iterator[tuple[str, bool]]:
+        """(key, alive) of what changed since the last call, in order."""
+        while True:
+            try:
+                key, alive = self._changes.get_nowait()
+            except queue.Empty:
+                return
+            (self._alive.add if alive else self._alive.discard)(key)
+            yield key, alive
+
+    def alive(self) -> frozenset[str]:
+        """The keys of all tokens now held."""
+        for _ in self.changes():
+            pass
+        return frozenset(self._alive)
