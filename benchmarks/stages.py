@@ -110,12 +110,12 @@ def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> d
         service = ReplayService(config, table, limiter, *servers)
         service.start()
         writer = ReplayWriter(session, keys, 10.0, stop)
-        reader = ReplayReader(session, keys, config.learner.batch_size, 4, 10.0, stop)
+        reader = ReplayReader(session, keys, config.learner.batch_size, 1, 4, 10.0, stop)
         numbered = iter(range(2**62))
 
         def insert() -> None:
             number = next(numbered)
-            writer.insert(replace(chunks[number % len(chunks)], sequence=number))
+            writer.insert([replace(chunks[number % len(chunks)], sequence=number)])
 
         for _ in chunks:
             insert()

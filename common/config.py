@@ -259,6 +259,8 @@ class LearnerConfig(Section):
     """Batches decoded ahead of the step. (ours)"""
     requests_in_flight: Count = 4
     """Sample requests sent ahead. (ours)"""
+    batches_per_request: Annotated[int, Field(ge=0)] = 0
+    """Mini-batches sampled by one request; 0: as many as fit 128 transitions, or 1. (ours)"""
     symmetries: bool = False
     """Turn and mirror each sampled transition by a random symmetry of the target layout, its
     action with it. (ours)"""
@@ -272,6 +274,11 @@ class LearnerConfig(Section):
     """Without a batch for so long, the learner says whom it waits for. (ours)"""
     seed: int = 0
     """Of the initial parameters and the symmetries drawn. (ours)"""
+
+    @property
+    def sample_size(self) -> int:
+        """Transitions of one sample request: whole mini-batches."""
+        return self.batch_size * (self.batches_per_request or max(1, 128 // self.batch_size))
 
 
 class EvaluatorConfig(Section):
@@ -325,8 +332,9 @@ class TransportConfig(Section):
     """Deadline of one query. (ours)"""
     max_message_bytes: Count = 64 << 20
     """Larger messages are refused. (ours)"""
-    shared_memory: bool = False
-    """Zenoh's implicit shared memory for large messages on one host. (ours)"""
+    shared_memory: bool = True
+    """Large messages between processes of one host go through memory that they share, where both
+    can reach it; over the network otherwise. (ours)"""
 
 
 class Config(Section):

@@ -8,6 +8,7 @@ MrcdrlError
 └── TransportError      the network did not do what was asked
     ├── EndpointError   an endpoint cannot be listened on or connected to
     ├── DeadlineError   a wait ended; the message says whom it waited for
+    ├── SlotError       memory that a peer lends is out of reach: the network must do
     └── RefusedError    the peer answered, and refused, with its reason
         └── HeldError   the peer's rate limiter held the request: try the same again
 """
@@ -43,6 +44,10 @@ class EndpointError(TransportError):
 
 class DeadlineError(TransportError):
     """A wait ended without an answer; the message says whom it waited for."""
+
+
+class SlotError(TransportError):
+    """Memory that a peer lends is out of reach; the message is the reason."""
 
 
 class RefusedError(TransportError):

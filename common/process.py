@@ -146,7 +146,7 @@ def fetch_config(session: Session, joining: Joining, stop: StopSignal) -> Config
     deadline = time.monotonic() + 30.0
     while True:
         try:
-            text = client.ask(b"").result().decode()
+            text = bytes(client.ask(b"").result()).decode()
         except DeadlineError as error:
             if time.monotonic() > deadline or stop.wait(0.2):
                 raise DeadlineError(f"{error}; is that the run's name?") from error

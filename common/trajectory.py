@@ -92,12 +92,12 @@ class Samples:
     keys: Int64Array  # [B], names the transition for a priority update
     probabilities: Float64Array  # [B], of having been drawn
     table_size: int  # transitions in the table when drawn
-    records: UInt8Array  # [B, W, R]
     actions: UInt8Array  # [B]
     rewards: Float32Array  # [B]
     discounts: Float32Array  # [B]
     bootstrap_offsets: UInt8Array  # [B]
     weights_versions: Int64Array  # [B], of the chunk the transition came from
+    records: UInt8Array  # [B, W, R]; last, so that a message of it can be made around it
 
     def __len__(self) -> int:
         return len(self.actions)

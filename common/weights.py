@@ -8,6 +8,7 @@ import logging
 import threading
 
 from common.errors import TransportError, WireError
+from common.framing import Part
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Weights
@@ -111,13 +112,13 @@ class WeightsReader:
                 told = True
         return None
 
-    def _ask(self) -> bytes | None:
+    def _ask(self) -> Part | None:
         try:
             return self._client.ask(b"").result()
         except TransportError:
             return None  # no learner yet; the caller asks again
 
-    def _newer(self, payload: bytes | None) -> Weights | None:
+    def _newer(self, payload: Part | None) -> Weights | None:
         if payload is None:
             return None
         try:

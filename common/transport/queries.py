@@ -2,33 +2,86 @@
 
 Invariants: Zenoh's callbacks only enqueue; a request is answered once, by a reply, a refusal, or
 "held", which asks for the same again; no reply at all becomes a DeadlineError that names the peer.
+
+A large message between processes of one host goes through a slot (`slots.py`); the query says so:
+
+    attachment of a request   "slot ADDRESS"               a large answer may be put there
+                              "slot ADDRESS START LENGTH"  and the request is there already
+    attachment of a reply     "near"                       the slot was opened
+                              "near START LENGTH"          and the message is there
+                              "far: REASON"                it could not be opened
 """
 
 import contextlib
 import queue
+import re
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import zenoh
 
-from common.errors import DeadlineError, HeldError, RefusedError, TransportError
+from common.errors import DeadlineError, HeldError, RefusedError, SlotError, TransportError
+from common.framing import Part
+from common.transport.slots import LARGE_BYTES, Lender, Slot, Slots, put, room
 
 _HELD = "held: "
+_FAR = "far: "
+_OFFER = re.compile(r"slot (\S+ \d+ \d+ \S+)(?: (\d{1,12}) (\d{1,12}))?")
+_NEAR = re.compile(r"near(?: (\d{1,12}) (\d{1,12}))?")
+_LATE_S = 1.0  # Zenoh ends a query at its own timeout; this more is for a callback that is late
 
 
 class Request:
     """A query to be answered once, by `reply`, `refuse` or `hold`."""
 
-    __slots__ = ("_query", "arrived_s", "payload")
+    __slots__ = ("_memory", "_near", "_query", "arrived_s", "payload")
 
-    def __init__(self, query: Any, payload: bytes) -> None:
+    def __init__(self, query: Any, payload: Part) -> None:
         self._query = query
+        self._memory: memoryview | None = None  # that the client lends
+        self._near: str | None = None  # what the reply says of it
         self.payload = payload
         self.arrived_s = time.monotonic()
 
-    def reply(self, payload: bytes) -> None:
-        self._answer(lambda: self._query.reply(self._query.key_expr, payload))
+    def open(self, slots: Slots, max_message_bytes: int) -> None:
+        """Reach for the slot that the client lends, if it does.
+
+        Raises SlotError where the payload is in a slot that is out of reach.
+        """
+        if self._query.attachment is None:
+            return
+        offer = _OFFER.fullmatch(self._query.attachment.to_bytes().decode("ascii", "replace"))
+        try:
+            if offer is None:
+                raise SlotError("no offer of a slot")
+            self._memory = slots.open(offer[1])
+        except SlotError as error:
+            if offer is not None and offer[2]:
+                raise
+            self._near = f"{_FAR}{error}"
+            return
+        self._near = "near"
+        if offer[2]:
+            self.payload = _within(self._memory, int(offer[2]), int(offer[3]), max_message_bytes)
+
+    def room(self, size: int) -> memoryview | None:
+        """Memory of the client for the last `size` bytes of a large reply, if it lends any."""
+        if self._memory is None or size < LARGE_BYTES:
+            return None
+        return room(self._memory, size)
+
+    def reply(self, payload: Part | Sequence[Part]) -> None:
+        """Answer with a message, given whole or in parts."""
+        parts = [payload] if isinstance(payload, Part) else payload
+        near = self._near
+        if self._memory is not None and sum(map(len, parts)) >= LARGE_BYTES:
+            place = put(self._memory, parts)
+            if place is not None:
+                near, parts = f"near {place[0]} {place[1]}", ()
+        message = b"".join(parts)
+        self._answer(lambda: self._query.reply(self._query.key_expr, message, attachment=near))
 
     def refuse(self, reason: str) -> None:
         """The peer's request is wrong; asking again would not help."""
@@ -36,7 +89,11 @@ class Request:
 
     def hold(self, reason: str) -> None:
         """Not now; the peer is to ask again."""
-        self._answer(lambda: self._query.reply_err((_HELD + reason).encode()))
+        self.refuse(_HELD + reason)
+
+    def cannot_open(self, reason: str) -> None:
+        """The peer is to ask again over the network."""
+        self.refuse(_FAR + reason)
 
     def _answer(self, answer: Callable[[], None]) -> None:
         # A peer that is gone by now asks again when it is back: nothing to report here.
@@ -46,11 +103,12 @@ class Request:
 
 
 class Server:
-    """Requests in the order of their arrival, for one or more serving threads."""
+    """Requests in the order of their arrival, for one serving thread."""
 
     def __init__(self, max_message_bytes: int, capacity: int) -> None:
         self._max_bytes = max_message_bytes
         self._waiting: queue.Queue[Request] = queue.Queue(capacity)
+        self._slots = Slots()
         self.refused = 0
 
     def offer(self, query: Any) -> None:
@@ -70,66 +128,144 @@ class Server:
     def take(self, timeout_s: float) -> Request | None:
         """The next request; None where none came within `timeout_s`."""
         try:
-            return self._waiting.get(timeout=timeout_s)
+            request = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             return None
+        try:
+            request.open(self._slots, self._max_bytes)
+        except SlotError as error:
+            request.cannot_open(str(error))
+            return None
+        return request
 
 
 class PendingReply:
-    """The reply to one query that is under way."""
+    """The reply to one query that is under way; for the thread that asked."""
 
-    def __init__(self, whom: str, timeout_s: float, max_message_bytes: int) -> None:
+    def __init__(
+        self,
+        whom: str,
+        timeout_s: float,
+        max_message_bytes: int,
+        lender: Lender,
+        slot: Slot | None,
+    ) -> None:
         self._whom = whom
-        self._deadline = time.monotonic() + timeout_s
+        self._deadline = time.monotonic() + timeout_s + _LATE_S
         self._max_bytes = max_message_bytes
-        self._replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.offer = self._replies.put
+        self._lender = lender
+        self._slot = slot
+        self._reply: Any = None
+        self._ended = threading.Event()
+
+    def offer(self, reply: Any) -> None:
+        """For Zenoh's callback."""
+        if self._reply is None:
+            self._reply = reply
+        self._ended.set()
 
     def end(self) -> None:
         """For Zenoh's callback: no further reply will come."""
-        self._replies.put(None)
+        self._ended.set()
 
-    def result(self) -> bytes:
-        """The reply's payload.
+    def wait(self, timeout_s: float) -> bool:
+        """Whether `result` would not have to wait; waits up to `timeout_s` until it is so."""
+        left = self._deadline - time.monotonic()
+        return self._ended.wait(max(min(timeout_s, left), 0.0)) or left <= timeout_s
+
+    def result(self) -> Part:
+        """The reply's payload, valid until `release`.
 
         Raises HeldError or RefusedError for a refusal, DeadlineError where no reply came.
         """
-        # Zenoh ends the query at its own timeout; the second more is for a callback that is late.
-        left = self._deadline + 1.0 - time.monotonic()
-        try:
-            reply = self._replies.get(timeout=max(left, 0.0))
-        except queue.Empty:
-            reply = None
+        self._ended.wait(max(self._deadline - time.monotonic(), 0.0))
+        reply = self._reply
         if reply is None:
             raise DeadlineError(f"no answer from {self._whom}")
         if reply.ok is not None:
-            if len(reply.ok.payload) > self._max_bytes:
-                raise RefusedError(f"the answer of {self._whom} exceeds {self._max_bytes} bytes")
-            payload: bytes = reply.ok.payload.to_bytes()
-            return payload
+            return self._payload(reply.ok)
         text = reply.err.payload.to_bytes().decode("utf-8", "replace")
-        if text.startswith(_HELD):
-            raise HeldError(text.removeprefix(_HELD))
         if text == "Timeout":
             raise DeadlineError(f"no answer from {self._whom} in time")
+        self.release()
+        if text.startswith(_FAR):
+            self._lender.refused(text.removeprefix(_FAR))
+            raise HeldError(text)
+        if text.startswith(_HELD):
+            raise HeldError(text.removeprefix(_HELD))
         raise RefusedError(f"{self._whom} refused: {text}")
+
+    def release(self) -> None:
+        """What `result` returned is no longer read.
+
+        Only after an answer: a peer that gave none may yet write to the slot.
+        """
+        if self._slot is not None:
+            self._lender.give_back(self._slot)
+            self._slot = None
+
+    def _payload(self, sample: Any) -> Part:
+        said = "" if sample.attachment is None else sample.attachment.to_bytes().decode()
+        near = _NEAR.fullmatch(said)
+        if near:
+            self._lender.opened()
+        elif said.startswith(_FAR):
+            self._lender.refused(said.removeprefix(_FAR))
+        try:
+            if near and near[1] and self._slot is not None:
+                start, length = int(near[1]), int(near[2])
+                return _within(self._slot.memory, start, length, self._max_bytes)
+        except SlotError as error:
+            raise RefusedError(f"the answer of {self._whom}: {error}") from error
+        self.release()
+        if len(sample.payload) > self._max_bytes:
+            raise RefusedError(f"the answer of {self._whom} exceeds {self._max_bytes} bytes")
+        payload: bytes = sample.payload.to_bytes()
+        return payload
 
 
 class Client:
-    """Sends queries to one key; any number may be under way."""
+    """Sends queries to one key; any number may be under way, all of one thread."""
 
-    def __init__(self, querier: Any, whom: str, timeout_s: float, max_message_bytes: int) -> None:
+    def __init__(
+        self, querier: Any, whom: str, timeout_s: float, max_message_bytes: int, lender: Lender
+    ) -> None:
         self._querier = querier
         self._whom = whom
         self._timeout_s = timeout_s
         self._max_bytes = max_message_bytes
+        self._lender = lender
 
-    def ask(self, payload: bytes) -> PendingReply:
-        """Send a query; its answer is waited for with `PendingReply.result`."""
-        pending = PendingReply(self._whom, self._timeout_s, self._max_bytes)
+    def ask(self, payload: Part | Sequence[Part], *, reply_bytes: int = 0) -> PendingReply:
+        """Send a query, given whole or in parts; its answer is waited for with `result`.
+
+        reply_bytes: about how large an answer is due.
+        """
+        parts = [payload] if isinstance(payload, Part) else payload
+        length = sum(map(len, parts))
+        slot, attachment = self._lend(max(length, reply_bytes)), None
+        if slot is not None:
+            attachment = f"slot {slot.address}"
+            if self._lender.near and length >= LARGE_BYTES:
+                place = put(slot.memory, parts)
+                if place is not None:
+                    attachment, parts = f"{attachment} {place[0]} {place[1]}", ()
+        pending = PendingReply(self._whom, self._timeout_s, self._max_bytes, self._lender, slot)
         handler = zenoh.handlers.Callback(pending.offer, pending.end, indirect=False)
         try:
-            self._querier.get(handler, payload=payload)
+            self._querier.get(handler, payload=b"".join(parts), attachment=attachment)
         except zenoh.ZError as error:
             raise TransportError(f"cannot ask {self._whom}: {error}") from error
         return pending
+
+    def _lend(self, size: int) -> Slot | None:
+        """A slot for a large message, or a first one to see whether the peer can open it."""
+        if size < LARGE_BYTES and self._lender.near is not None:
+            return None
+        return self._lender.borrow(size)
+
+
+def _within(memory: memoryview, start: int, length: int, max_bytes: int) -> memoryview:
+    if start + length > len(memory) or length > max_bytes:
+        raise SlotError(f"{length} bytes at {start} of a slot of {len(memory)}")
+    return memory[start : start + length]

@@ -19,6 +19,7 @@ from common.config import TransportConfig
 from common.errors import EndpointError
 from common.transport.publications import LatestSubscriber, Presence, Publisher, QueueSubscriber
 from common.transport.queries import Client, Server
+from common.transport.slots import Lender
 
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _OPEN_ATTEMPT_MS = 2_000
@@ -82,8 +83,13 @@ class Session:
         self._declare(self._session.declare_queryable(key, handler, complete=True))
         return server
 
-    def client(self, key: str, whom: str, timeout_s: float | None = None) -> Client:
-        """Asks the queryable on `key`; `whom` names it in errors."""
+    def client(
+        self, key: str, whom: str, timeout_s: float | None = None, *, lends: bool = False
+    ) -> Client:
+        """Asks the queryable on `key`; `whom` names it in errors and in the log.
+
+        lends: large messages go through shared memory where the peer can reach it.
+        """
         timeout = self._config.timeout_s if timeout_s is None else timeout_s
         querier = self._session.declare_querier(
             key,
@@ -91,7 +97,9 @@ class Session:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout,
         )
-        return Client(self._declare(querier), whom, timeout, self._config.max_message_bytes)
+        lender = Lender(whom, enabled=lends and self._config.shared_memory)
+        max_bytes = self._config.max_message_bytes
+        return Client(self._declare(querier), whom, timeout, max_bytes, lender)
 
     def announce(self, key: str) -> None:
         """Hold a liveliness token on `key` for as long as the session is open."""
@@ -166,7 +174,7 @@ def _zenoh_config(config: TransportConfig) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "transport/link/tx/queue/size/data": 16,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
-        "transport/shared_memory/enabled": config.shared_memory,
+        "transport/shared_memory/enabled": False,  # our own, in slots.py, has no pool to overflow
     }
     for key, value in settings.items():
         result.insert_json5(key, json.dumps(value))

@@ -1,9 +1,10 @@
 """A bounded spool between the arenas and replay, emptied by a thread of its own.
 
-Invariants: chunks leave in order; none is dropped: a full spool makes `put` wait, which is how
-replay's rate limiter holds the arenas back.
+Invariants: chunks leave in order, all that wait at once; none is dropped: a full spool makes `put`
+wait, which is how replay's rate limiter holds the arenas back.
 """
 
+import contextlib
 import queue
 import threading
 
@@ -52,17 +53,20 @@ class Sender:
     def _run(self) -> None:
         while True:
             try:
-                chunk = self._spool.get(timeout=_POLL_S)
+                chunks = [self._spool.get(timeout=_POLL_S)]
             except queue.Empty:
                 if self._closing.is_set():
                     return
                 continue
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    chunks.append(self._spool.get_nowait())
             try:
-                reply = self._writer.insert(chunk)
+                reply = self._writer.insert(chunks)
             except Exception as error:  # noqa: BLE001  raised again by put, in the owner's thread
                 self._error = error
                 return
             if reply is None:
                 return
-            self.chunks += 1
-            self.transitions += len(chunk)
+            self.chunks += len(chunks)
+            self.transitions += sum(map(len, chunks))

@@ -47,14 +47,22 @@ def main(argv: Sequence[str]) -> int:
         )
         keeper = Keeper(config, learner, joining.run_dir / "checkpoints")
         reader = ReplayReader(
-            bulk, keys, settings.batch_size, settings.requests_in_flight, settings.warn_s, stop
+            bulk,
+            keys,
+            settings.batch_size,
+            settings.sample_size // settings.batch_size,
+            settings.requests_in_flight,
+            settings.warn_s,
+            stop,
         )
         prefetcher = Prefetcher(
             reader, make_collate(config, learner), settings.prefetch_batches, stop
         )
         priorities = None
         if config.replay.prioritized:
-            priorities = PrioritiesSender(PriorityWriter(bulk, keys), settings.prefetch_batches)
+            priorities = PrioritiesSender(
+                PriorityWriter(bulk, keys, stop), settings.prefetch_batches
+            )
         writer = WeightsWriter(session, keys)
         reporter = StatsReporter(
             session.publisher(keys.stats("learner", worker)), "learner", worker

@@ -108,7 +108,7 @@ def build(config: Config) -> tuple[Table, RateLimiter]:
         config.replay.min_size,
         config.replay.tolerance,
         largest_insert=config.actor.chunk_length,
-        largest_sample=config.learner.batch_size,
+        largest_sample=config.learner.sample_size,
     )
     return table, limiter
 

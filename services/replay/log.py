@@ -19,6 +19,7 @@ from pathlib import Path
 
 from common.errors import RunDirectoryError
 from common.files import reason, sync_directory
+from common.framing import Part
 
 _LOG = logging.getLogger("replay")
 _HEADER = struct.Struct("<II")
@@ -91,18 +92,18 @@ class SegmentLog:
         if self._segments:
             self._open(self._segments[-1], self._size)
 
-    def append(self, payload: bytes, first_key: int, num_transitions: int) -> None:
+    def append(self, payload: Part, first_key: int, num_transitions: int) -> None:
         """Write one record; raises OSError, and then the record is not in the log."""
         if self._descriptor is None or self._size >= self._segment_bytes:
             self._rotate(first_key)
-        record = _HEADER.pack(len(payload), zlib.crc32(payload)) + payload
+        head = _HEADER.pack(len(payload), zlib.crc32(payload))
         try:
-            self._write(record)
+            self._write(head, payload)
         except OSError:
             if self._descriptor is not None:
                 os.ftruncate(self._descriptor, self._size)
             raise
-        self._size += len(record)
+        self._size += len(head) + len(payload)
         self._segments[-1].next_key = first_key + num_transitions
 
     def forget(self, first_key: int) -> None:
@@ -117,12 +118,14 @@ class SegmentLog:
             os.close(self._descriptor)
             self._descriptor = None
 
-    def _write(self, record: bytes) -> None:
+    def _write(self, *parts: Part) -> None:
         if self._descriptor is None:
             raise ValueError("the log is closed")
-        remaining = memoryview(record)
-        while remaining:
-            remaining = remaining[os.write(self._descriptor, remaining) :]
+        written = os.writev(self._descriptor, parts)
+        if written < sum(map(len, parts)):  # no space for all of it: the next write says why
+            remaining = memoryview(b"".join(parts))[written:]
+            while remaining:
+                remaining = remaining[os.write(self._descriptor, remaining) :]
         if self._fsync:
             os.fsync(self._descriptor)
 

@@ -8,14 +8,15 @@ to try again.
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from common.config import Config
 from common.errors import WireError
 from common.files import reason
+from common.framing import Part, split_set
 from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply
-from common.wire import SampleRequest, decode, encode
+from common.wire import SampleRequest, decode, encode, encode_parts
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
 from services.replay.sequence import Arrival, SequenceBook
@@ -32,10 +33,13 @@ _COUNTS = (
 class _Request(Protocol):
     """What the service needs of a transport's request."""
 
-    payload: bytes
-    arrived_s: float
+    @property
+    def payload(self) -> Part: ...
+    @property
+    def arrived_s(self) -> float: ...
 
-    def reply(self, payload: bytes) -> None: ...
+    def room(self, size: int) -> memoryview | None: ...
+    def reply(self, payload: Part | Sequence[Part]) -> None: ...
     def refuse(self, reason: str) -> None: ...
     def hold(self, reason: str) -> None: ...
 
@@ -141,27 +145,44 @@ class ReplayService:
                 request.refuse(str(error))
 
     def _insert(self, request: _Request) -> None:
-        chunk = decode(Chunk, request.payload)
+        messages = split_set(request.payload)
+        chunks = [self._checked(message) for message in messages]
+        with self._changed:
+            for message, chunk in zip(messages, chunks, strict=True):
+                arrival = self._classify(chunk)
+                if not (arrival is Arrival.REPEATED or self._admitted(request, message, chunk)):
+                    return
+                self._store(chunk, arrival)
+                self._changed.notify_all()
+            total = self._table.next_key
+        request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
+
+    def _checked(self, message: Part) -> Chunk:
+        chunk = decode(Chunk, message)
         self._table.check(chunk)
         if len(chunk) > self._limiter.largest_insert:
             raise WireError(
                 f"{len(chunk)} transitions where the run's actor.chunk_length is "
                 f"{self._limiter.largest_insert}: the rate limiter might never let them in"
             )
-        with self._changed:
-            arrival = self._classify(chunk)
-            if arrival is not Arrival.REPEATED:
-                if not self._wait(
-                    "insert_held", request, lambda: self._limiter.can_insert(len(chunk))
-                ):
-                    request.hold("the learner has not sampled enough of what is there yet")
-                    return
-                if not self._logged(request, len(chunk)):
-                    return
-            self._store(chunk, arrival)
-            self._changed.notify_all()
-            total = self._table.next_key
-        request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
+        return chunk
+
+    def _admitted(self, request: _Request, message: Part, chunk: Chunk) -> bool:
+        """Whether the chunk may enter the table and is in the log; else the request is held."""
+        if not self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
+            request.hold("the learner has not sampled enough of what is there yet")
+            return False
+        try:
+            if self._log is not None:
+                self._log.append(message, self._table.next_key, len(chunk))
+        except OSError as error:
+            self._counts["log_errors"] += 1
+            if self._counts["log_errors"] == 1:
+                _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
+            request.hold(f"replay's log cannot be written: {reason(error)}")
+            return False
+        self._forget()
+        return True
 
     def _classify(self, chunk: Chunk) -> Arrival:
         return self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
@@ -176,21 +197,6 @@ class ReplayService:
         self._limiter.inserts += len(chunk)
         self._counts["chunks"] += 1
         self._counts["gaps"] += arrival is Arrival.GAP
-
-    def _logged(self, request: _Request, num_transitions: int) -> bool:
-        """Whether the request's chunk is in the log; else the request is held."""
-        if self._log is None:
-            return True
-        try:
-            self._log.append(request.payload, self._table.next_key, num_transitions)
-        except OSError as error:
-            self._counts["log_errors"] += 1
-            if self._counts["log_errors"] == 1:
-                _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
-            request.hold(f"replay's log cannot be written: {reason(error)}")
-            return False
-        self._forget()
-        return True
 
     def _forget(self) -> None:
         """Drop what the table has evicted; a file that stays is only in the way."""
@@ -209,10 +215,10 @@ class ReplayService:
             if not self._wait("sample_held", request, lambda: self._limiter.can_sample(size)):
                 request.hold(self._why_no_sample())
                 return
-            samples = self._table.sample(size)
+            samples = self._table.sample(size, request.room(self._table.sample_bytes(size)))
             self._limiter.samples += size
             self._changed.notify_all()
-        request.reply(encode(samples))
+        request.reply(encode_parts(samples))
 
     def _prioritize(self, request: _Request) -> None:
         message = decode(Priorities, request.payload)

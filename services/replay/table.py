@@ -1,21 +1,19 @@
 """The table: a ring of observation records in stream order, and the transitions over them.
 
 Invariants (`check_invariants`): transition keys are consecutive, the newest `size` of all ever
-inserted; each touches `window` consecutive rows of one chunk that is whole in the ring; rows of
-different chunks never overlap. Pure: no clock, lock or transport.
+inserted; each touches `window` consecutive rows of one chunk that is whole in the ring; chunks
+share rows only where one goes on with the records that the one before it ends with. Pure: no
+clock, lock or transport.
 """
 
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from common.errors import ConfigError, WireError
 from common.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
 from services.replay.sampler import Sampler
-
-_CHUNK_ENDS = 2.0  # history and tail a full chunk's length of transitions: last chunks are short
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class Table:
     capacity: transitions. stack: records of a state. n_step: longest return; a transition
     touches a window of stack + n_step records. chunk_length: transitions of most chunks; many
     shorter ones leave less than the capacity. record_bytes: length of one record. sampler: of the
-    same capacity, for this table alone.
+    same capacity, for this table alone. All memory is taken, and touched, at once.
     """
 
     def __init__(
@@ -47,9 +45,9 @@ class Table:
         sampler: Sampler,
     ) -> None:
         window = stack + n_step
-        num_rows = int(capacity * (1 + _CHUNK_ENDS * (window - 1) / chunk_length)) + 2 * window
+        num_rows = int(capacity * (1 + (window - 1) / chunk_length)) + 2 * window
         try:
-            self._rows: UInt8Array = np.zeros((num_rows, record_bytes), np.uint8)
+            self._rows: UInt8Array = np.full((num_rows, record_bytes), 0, np.uint8)
         except MemoryError as error:
             raise ConfigError(
                 f"replay.capacity {capacity} needs {num_rows * record_bytes >> 20} MiB for its "
@@ -58,8 +56,7 @@ class Table:
         self._capacity = capacity
         self._window = window
         self._n_step = n_step
-        # [num_rows - window + 1, window, R], a view: sampling is one gather of contiguous spans.
-        self._windows = sliding_window_view(self._rows, window, axis=0).transpose(0, 2, 1)
+        self._in_window = np.arange(window)
         self._start_rows = np.zeros(capacity, np.int64)
         self._actions = np.zeros(capacity, np.uint8)
         self._rewards = np.zeros(capacity, np.float32)
@@ -132,9 +129,10 @@ class Table:
         self.check(chunk)
         length, num_rows = len(chunk), len(chunk.records)
         oldest = self.first_key
-        first_row = self._make_room(length, num_rows)
+        shared = self._window - 1 if self._goes_on(chunk) else 0
+        first_row = self._make_room(length, num_rows - shared) - shared
         self._sampler.evict(range(oldest, self.first_key))
-        self._rows[first_row : first_row + num_rows] = chunk.records
+        self._rows[first_row + shared : first_row + num_rows] = chunk.records[shared:]
         slots = (self._next_key + np.arange(length)) % self._capacity
         self._start_rows[slots] = first_row + np.arange(length)
         self._actions[slots] = chunk.actions
@@ -155,8 +153,15 @@ class Table:
         there = (keys >= self.first_key) & (keys < self._next_key)
         return self._sampler.update(keys[there], priorities[there])
 
-    def sample(self, size: int) -> Samples:
-        """`size` transitions as the sampler draws them; ValueError when the table is empty."""
+    def sample_bytes(self, size: int) -> int:
+        """Length of the records of `size` transitions."""
+        return size * self._window * int(self._rows.shape[1])
+
+    def sample(self, size: int, out: memoryview | None = None) -> Samples:
+        """`size` transitions as the sampler draws them; ValueError when the table is empty.
+
+        out: memory of `sample_bytes` for their records.
+        """
         if len(self) == 0:
             raise ValueError("cannot sample from an empty table")
         keys, probabilities = self._sampler.sample(self.keys, size)
@@ -165,13 +170,32 @@ class Table:
             keys=keys,
             probabilities=probabilities,
             table_size=len(self),
-            records=self._windows[self._start_rows[slots]],
             actions=self._actions[slots],
             rewards=self._rewards[slots],
             discounts=self._discounts[slots],
             bootstrap_offsets=self._bootstrap_offsets[slots],
             weights_versions=self._weights_versions[slots],
+            records=self._gather(self._start_rows[slots], out),
         )
+
+    def _gather(self, start_rows: Int64Array, out: memoryview | None) -> UInt8Array:
+        """The records [B, W, R] of the windows that begin at rows [B]."""
+        rows = (start_rows[:, None] + self._in_window).reshape(-1)
+        record_bytes = self._rows.shape[1]
+        flat = None if out is None else np.frombuffer(out, np.uint8).reshape(-1, record_bytes)
+        # "clip" writes straight into `out`; the rows are all there.
+        records: UInt8Array = self._rows.take(rows, axis=0, out=flat, mode="clip")
+        return records.reshape(len(start_rows), self._window, record_bytes)
+
+    def _goes_on(self, chunk: Chunk) -> bool:
+        """Whether the chunk begins with the records that the newest one ends with.
+
+        So do two chunks of one robot when no other came between.
+        """
+        overlap, end = self._window - 1, self._next_row
+        if not self._extents or end + len(chunk.records) - overlap > len(self._rows):
+            return False
+        return np.array_equal(self._rows[end - overlap : end], chunk.records[:overlap])
 
     def _make_room(self, num_transitions: int, num_rows: int) -> int:
         """Evict until both fit; the first of `num_rows` free consecutive rows."""
@@ -194,14 +218,18 @@ class Table:
         """Raise AssertionError where one of the module's invariants does not hold."""
         key = self.first_key
         taken = np.zeros(len(self._rows), bool)
+        end = -1
         for extent in self._extents:
             if extent.first_key != key:
                 raise AssertionError(f"key {extent.first_key} follows where {key} is due")
             key += extent.num_transitions
-            rows = slice(extent.first_row, extent.first_row + extent.num_rows)
-            if taken[rows].any():
-                raise AssertionError("two chunks share a row")
-            taken[rows] = True
+            first, stop = extent.first_row, extent.first_row + extent.num_rows
+            if first == end - (self._window - 1):
+                first = end
+            if taken[first:stop].any():
+                raise AssertionError("two chunks share rows, and neither goes on with the other")
+            taken[first:stop] = True
+            end = stop
         if key != self._next_key or len(self) > self._capacity:
             raise AssertionError("keys are not the newest of all inserted, or exceed the capacity")
         self._sampler.check_invariants(self.keys)

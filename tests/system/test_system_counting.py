@@ -221,7 +221,7 @@ def test_every_transition_arrives_once_whole_and_in_order(
             listener = Listener(session.queue_subscriber(keys.every_stats))
             writer = WeightsWriter(session, keys)
             writer.publish(weights)
-            reader = ReplayReader(session, keys, BATCH, 2, 10.0, watched)
+            reader = ReplayReader(session, keys, BATCH, 1, 2, 10.0, watched)
             witness = Witness(CONFIG, reader, weights)
             renamed = Weights(1, 2, 0, weights.payload)  # so that actions stay comparable
             try:

@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -23,16 +23,19 @@ class FakeWriter:
     prompt: bool = True
     refuses: bool = False
     stopped: bool = False
+    requests: int = 0
     inserted: queue.Queue[int] = field(default_factory=queue.Queue)
     go_on: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
 
-    def insert(self, chunk: Chunk) -> InsertReply | None:
-        self.inserted.put(chunk.sequence)
+    def insert(self, chunks: Sequence[Chunk]) -> InsertReply | None:
+        for chunk in chunks:
+            self.inserted.put(chunk.sequence)
+        self.requests += 1
         if not self.prompt:
             assert self.go_on.acquire(timeout=_DEADLINE_S)
         if self.refuses:
             raise RefusedError("replay refused: another arena")
-        return None if self.stopped else InsertReply(chunk.sequence, False, 0)
+        return None if self.stopped else InsertReply(chunks[-1].sequence, False, 0)
 
     def next(self) -> int:
         return self.inserted.get(timeout=_DEADLINE_S)
@@ -87,6 +90,19 @@ def test_a_full_spool_makes_put_wait_and_drops_nothing() -> None:
         assert sender.put(chunk(3), _DEADLINE_S)
     assert [writer.next() for _ in range(2)] == [2, 3]
     assert sender.chunks == 4
+
+
+def test_all_that_waits_leaves_at_once() -> None:
+    writer = FakeWriter(prompt=False)
+    with sending(writer) as sender:
+        assert sender.put(chunk(0), _DEADLINE_S)
+        assert writer.next() == 0
+        for sequence in range(1, 6):
+            assert sender.put(chunk(sequence), 0.0)
+        writer.go_on.release()
+        assert [writer.next() for _ in range(5)] == [1, 2, 3, 4, 5]
+    assert writer.requests == 2
+    assert sender.chunks == 6
 
 
 def test_close_sends_what_is_spooled_and_ends_the_thread() -> None:

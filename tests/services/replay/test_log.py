@@ -108,10 +108,13 @@ def test_a_failed_append_leaves_the_log_as_it_was(
     log.append(PAYLOADS[0], 0, 10)
     real = os.write
 
+    def short(descriptor: int, parts: Sequence[bytes]) -> int:
+        return real(descriptor, b"".join(parts)[:7])
+
     def full(descriptor: int, data: bytes) -> int:
-        real(descriptor, bytes(data)[:7])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    monkeypatch.setattr(os, "writev", short)
     monkeypatch.setattr(os, "write", full)
     with pytest.raises(OSError, match="No space left"):
         log.append(PAYLOADS[1], 10, 10)

@@ -1,11 +1,13 @@
 """A replay service that is started again holds what the one before it acknowledged."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from common.config import Config, load_config
+from common.framing import Part
 from common.trajectory import Chunk
 from common.wire import encode
 from services.replay.__main__ import build, open_log
@@ -38,7 +40,10 @@ class Answered:
         self.arrived_s = 0.0
         self.answers: list[str] = []
 
-    def reply(self, payload: bytes) -> None:
+    def room(self, size: int) -> None:
+        return None
+
+    def reply(self, payload: Part | Sequence[Part]) -> None:
         self.answers.append("reply")
 
     def refuse(self, reason: str) -> None:

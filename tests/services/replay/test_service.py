@@ -5,7 +5,7 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from common.config import Config, ReplayConfig, TransportConfig
+from common.framing import Part, join_set
 from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples, Stats
-from common.wire import SampleRequest, decode, encode
+from common.wire import SampleRequest, decode, encode, encode_parts
 from services.replay.limiter import RateLimiter
 from services.replay.sampler import PrioritizedSampler, UniformSampler
 from services.replay.service import ReplayService
@@ -32,8 +33,12 @@ class FakeRequest:
     arrived_s: float = field(default_factory=time.monotonic)
     answers: queue.Queue[tuple[str, bytes | str]] = field(default_factory=queue.Queue)
 
-    def reply(self, payload: bytes) -> None:
-        self.answers.put(("reply", payload))
+    def room(self, size: int) -> None:
+        return None
+
+    def reply(self, payload: Part | Sequence[Part]) -> None:
+        whole = payload if isinstance(payload, Part) else b"".join(payload)
+        self.answers.put(("reply", bytes(whole)))
 
     def refuse(self, reason: str) -> None:
         self.answers.put(("refuse", reason))
@@ -52,7 +57,7 @@ class WatchfulRequest(FakeRequest):
     table: Table | None = None
     stored_when_acknowledged: int = -1
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: Part | Sequence[Part]) -> None:
         assert self.table is not None
         self.stored_when_acknowledged = len(self.table)
         super().reply(payload)
@@ -182,6 +187,37 @@ def test_a_gap_is_stored_and_counted() -> None:
         assert not inserted(up.insert(chunk_bytes(0, incarnation=2))).duplicate
         metrics = up.service.metrics()
         assert (metrics["chunks"], metrics["gaps"], metrics["inserts"]) == (3, 1, 3 * LENGTH)
+
+
+def set_bytes(*sequences: int) -> bytes:
+    return b"".join(join_set([encode_parts(chunk(sequence)) for sequence in sequences]))
+
+
+def test_chunks_that_come_together_are_acknowledged_together() -> None:
+    with replay() as up:
+        up.fill(1)
+        assert inserted(up.insert(set_bytes(0, 1, 2))) == InsertReply(2, False, 3 * LENGTH)
+        assert inserted(up.insert(set_bytes(1, 2))) == InsertReply(2, True, 3 * LENGTH)
+        metrics = up.service.metrics()
+        assert (metrics["chunks"], metrics["duplicates"], metrics["gaps"]) == (3, 3, 0)
+
+
+def test_of_chunks_that_come_together_one_that_is_wrong_refuses_all() -> None:
+    wrong = dataclasses.replace(chunk(1), records=np.zeros((LENGTH + 2, 5), np.uint8))
+    with replay() as up:
+        kind, reason = up.insert(b"".join(join_set([encode_parts(chunk(0)), encode_parts(wrong)])))
+        assert kind == "refuse"
+        assert "another arena or agent" in str(reason)
+        assert len(up.table) == 0
+
+
+def test_of_chunks_that_come_together_those_before_one_that_is_held_are_stored() -> None:
+    with replay(min_size=2 * LENGTH, ratio=1.0, buffer=2.0 * LENGTH, hold_s=0.05) as up:
+        kind, _ = up.insert(set_bytes(0, 1, 2, 3, 4, 5))
+        assert kind == "hold"
+        assert len(up.table) == 4 * LENGTH
+        assert up.sample(BATCH)[0] == up.sample(BATCH)[0] == "reply"
+        assert inserted(up.insert(set_bytes(0, 1, 2, 3, 4))) == InsertReply(4, False, 5 * LENGTH)
 
 
 REFUSED = {

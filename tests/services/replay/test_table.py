@@ -3,6 +3,7 @@
 With both samplers; how prioritized draws are spread and weighed is in test_sampler.py.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -107,6 +108,8 @@ class TableAgainstList(RuleBasedStateMachine):
             chunk = make_chunk(
                 len(self.lengths), length, stack=self.stack, n_step=self.n_step, priorities=given
             )
+            if self.model and data.draw(st.booleans()):
+                chunk = going_on(chunk, self.model[-1].records)
             self.table.insert(chunk)
             self.priorities += given or [self.largest] * length
             self.largest = max(self.largest, *given, 0.0)
@@ -235,11 +238,44 @@ def test_a_chunk_of_other_settings_is_refused(chunk: Callable[[], Chunk], reason
     table.check_invariants()
 
 
+def going_on(chunk: Chunk, before: UInt8Array) -> Chunk:
+    """The chunk with the records that a window [W, R] before it ends with as its first."""
+    overlap = len(before) - 1
+    records = np.concatenate([before[-overlap:], chunk.records[overlap:]])
+    return dataclasses.replace(chunk, records=records)
+
+
+def test_one_robots_consecutive_chunks_share_their_records() -> None:
+    table = make_table(100, stack=4, n_step=1)
+    stream = np.arange(4 + 1000, dtype=np.uint32).view(np.uint8).reshape(-1, 4)
+    for number in range(100):
+        first = 10 * number
+        records = stream[first : first + 3 + 10 + 1]
+        table.insert(dataclasses.replace(make_chunk(number, 10), records=records))
+        table.check_invariants()
+    assert len(table) == 100
+    samples = table.sample(400)
+    starts = samples.keys
+    expected = stream[starts[:, None] + np.arange(5)]
+    np.testing.assert_array_equal(samples.records, expected)
+
+
+def test_records_are_gathered_into_memory_of_the_caller() -> None:
+    table = make_table(100)
+    table.insert(make_chunk(1, 10))
+    memory = bytearray(table.sample_bytes(6))
+    samples = table.sample(6, memoryview(memory))
+    assert np.shares_memory(samples.records, np.frombuffer(memory, np.uint8))
+    assert samples.records.tobytes() == memory
+    stored = {bytes(window) for window in table.sample(400).records}
+    assert {bytes(window) for window in samples.records} <= stored
+
+
 def test_memory_is_the_rows_and_the_columns() -> None:
     rng = np.random.default_rng(0)
     table = Table(1000, 4, 1, 50, 80, UniformSampler(rng))
     per_transition = 8 + 1 + 4 + 4 + 1 + 8
-    assert table.nbytes == (1160 + 2 * 5) * 80 + 1000 * per_transition
+    assert table.nbytes == (1080 + 2 * 5) * 80 + 1000 * per_transition
     assert table.capacity == 1000
     prioritized = Table(1000, 4, 1, 50, 80, PrioritizedSampler(1000, EXPONENT, rng))
     assert prioritized.nbytes == table.nbytes + 2 * 1024 * 8
