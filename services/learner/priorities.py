@@ -30,6 +30,11 @@ class PrioritiesSender:
         self._thread = threading.Thread(target=self._run, name="priorities")
         self._thread.start()
 
+    @property
+    def waiting(self) -> int:
+        """Batches whose errors are not sent yet."""
+        return len(self._waiting)
+
     def put(self, keys: Int64Array, td_errors: torch.Tensor) -> None:
         """TD errors float32 [B], on any device, of the transitions keys int64 [B].
 

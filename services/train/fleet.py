@@ -20,7 +20,7 @@ from common.process import DIE_WITH_PARENT
 
 _LOG = logging.getLogger("train")
 # Freed memory stays with the process: else each large tensor is mapped afresh at every step.
-_ALLOCATOR = {
+ALLOCATOR = {
     "MALLOC_MMAP_MAX_": "0",
     "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
     "MALLOC_TOP_PAD_": str(64 << 20),
@@ -47,7 +47,7 @@ class Service:
 
     def start(self) -> None:
         command = [sys.executable, "-m", f"services.{self.role}", *self.arguments]
-        environment = {**_ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: str(os.getpid())}
+        environment = {**ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: str(os.getpid())}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(
                 command,
