@@ -131,7 +131,8 @@ class Table:
         oldest = self.first_key
         shared = self._window - 1 if self._goes_on(chunk) else 0
         first_row = self._make_room(length, num_rows - shared) - shared
-        self._sampler.evict(range(oldest, self.first_key))
+        if self.first_key > oldest:
+            self._sampler.evict(range(oldest, self.first_key))
         self._rows[first_row + shared : first_row + num_rows] = chunk.records[shared:]
         slots = (self._next_key + np.arange(length)) % self._capacity
         self._start_rows[slots] = first_row + np.arange(length)
