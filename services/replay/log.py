@@ -35,6 +35,30 @@ class _Segment:
     next_key: int
 
 
+def segment_paths(directory: Path) -> list[Path]:
+    """The segments in a directory, oldest first."""
+    return sorted(directory.glob(f"*{_SUFFIX}"))
+
+
+def read_segment(path: Path) -> Iterator[tuple[int, int, bytes | None]]:
+    """Of each record where it begins, where it ends, and its payload, None where that is corrupt.
+
+    Ends at the first record that is not whole: what is left of the file is a torn tail, bytes
+    of a write that never ended or, after a power cut, of one that never began.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        offset = 0
+        while offset + _HEADER.size <= size:
+            length, crc = _HEADER.unpack(file.read(_HEADER.size))
+            end = offset + _HEADER.size + length
+            if length == 0 or end > size:
+                break
+            payload = file.read(length)
+            yield offset, end, payload if zlib.crc32(payload) == crc else None
+            offset = end
+
+
 class SegmentLog:
     """Appends payloads to segments of about `segment_bytes`.
 
@@ -52,8 +76,7 @@ class SegmentLog:
         except OSError as error:
             raise RunDirectoryError(f"cannot make {directory}: {reason(error)}") from error
         self._segments = deque(
-            _Segment(path, int(path.stem), int(path.stem))
-            for path in sorted(directory.glob(f"*{_SUFFIX}"))
+            _Segment(path, int(path.stem), int(path.stem)) for path in segment_paths(directory)
         )
         self.corrupt = 0
         """Records skipped because their bytes were not what was written."""
@@ -70,25 +93,19 @@ class SegmentLog:
         """
         for segment in self._segments:
             segment.first_key = next_key()
-            data = segment.path.read_bytes()
-            offset = 0
-            while offset + _HEADER.size <= len(data):
-                length, crc = _HEADER.unpack_from(data, offset)
-                payload = data[offset + _HEADER.size : offset + _HEADER.size + length]
-                if len(payload) < length:
-                    break
-                if zlib.crc32(payload) == crc:
-                    yield payload
-                else:
+            self._size = 0
+            for offset, end, payload in read_segment(segment.path):
+                if payload is None:
                     self.corrupt += 1
                     _LOG.warning("%s: record at byte %d is corrupt, skipped", segment.path, offset)
-                offset += _HEADER.size + length
-            if offset < len(data):
-                lost = len(data) - offset
+                else:
+                    yield payload
+                self._size = end
+            lost = segment.path.stat().st_size - self._size
+            if lost:
                 _LOG.warning("%s: torn tail of %d bytes cut off", segment.path, lost)
-                os.truncate(segment.path, offset)
+                os.truncate(segment.path, self._size)
             segment.next_key = next_key()
-            self._size = offset
         if self._segments:
             self._open(self._segments[-1], self._size)
 

@@ -74,6 +74,18 @@ def test_a_torn_tail_is_cut_off_and_the_log_goes_on(
     assert recover(open_log(directory)) == [PAYLOADS[0], b"new"]
 
 
+def test_zeros_at_the_end_are_a_torn_tail(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What a power cut leaves of a file that grew, but whose bytes were not on the disk yet."""
+    write(tmp_path, PAYLOADS[:2])
+    (segment,) = segments(tmp_path)
+    with segment.open("ab") as file:
+        file.write(bytes(1000))
+    assert recover(open_log(tmp_path)) == PAYLOADS[:2]
+    assert f"{segment}: torn tail of 1000 bytes cut off" in caplog.text
+
+
 def test_a_corrupt_record_is_skipped_counted_and_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
