@@ -209,6 +209,8 @@ class ReplayConfig(Section):
     the disk's pace; `off` keeps no log. (ours)"""
     segment_bytes: Count = 64 << 20
     """Size at which the log starts a new file; whole files go as the table evicts. (ours)"""
+    snapshot_period_s: Positive = 10.0
+    """Between snapshots of the priorities and counters, which the log does not hold. (ours)"""
     seed: int = 0
     """Of the sampler. (ours)"""
 

@@ -4,6 +4,7 @@ Invariant: once `min_size` is reached, samples stay within `error_buffer` of
 `samples_per_insert` x (inserts - min_size) whenever both sides ask before they act.
 """
 
+import math
 from dataclasses import dataclass
 
 from common.errors import ConfigError
@@ -74,6 +75,18 @@ class RateLimiter:
         """
         self.inserts = size
         self.samples = round(max(size - self.min_size, 0) * self.samples_per_insert)
+
+    def restore(self, inserts: int, samples: int) -> None:
+        """Go on with an earlier process's counters, its table whole and at least `min_size`.
+
+        Where samples given since they were noted, or other settings, have led beyond the error
+        buffer, they are brought back to its edge.
+        """
+        self.inserts, self.samples = inserts, samples
+        if self.samples_per_insert:
+            due = (inserts - self.min_size) * self.samples_per_insert
+            least, most = math.ceil(due - self.error_buffer), math.floor(due + self.error_buffer)
+            self.samples = max(min(max(samples, least), most), 0)
 
     @property
     def ratio(self) -> float:

@@ -82,6 +82,11 @@ class SegmentLog:
         """Records skipped because their bytes were not what was written."""
 
     @property
+    def directory(self) -> Path:
+        """Where the segments lie."""
+        return self._directory
+
+    @property
     def first_key(self) -> int:
         """Key of the oldest transition kept; 0 in an empty log."""
         return self._segments[0].first_key if self._segments else 0

@@ -22,6 +22,19 @@ class Sampler(Protocol):
         """Memory of what it keeps a transition."""
         ...
 
+    @property
+    def largest(self) -> float:
+        """Priority so far, which a transition gets that comes without one."""
+        ...
+
+    def raise_largest(self, priority: float) -> None:
+        """Take it that a priority so large was there."""
+        ...
+
+    def shares(self, keys: range) -> Float64Array:
+        """A copy of what keys of the table are drawn in proportion to [len(keys)]; or none [0]."""
+        ...
+
     def insert(self, keys: range, priorities: Float32Array) -> None:
         """These are in the table now; priorities: absolute TD errors [len(keys)], or none [0]."""
         ...
@@ -47,9 +60,16 @@ class UniformSampler:
     """Each transition as likely as any other; priorities mean nothing."""
 
     nbytes = 0
+    largest = 1.0
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
+
+    def raise_largest(self, priority: float) -> None:
+        pass
+
+    def shares(self, keys: range) -> Float64Array:
+        return np.empty(0, np.float64)
 
     def insert(self, keys: range, priorities: Float32Array) -> None:
         pass
@@ -86,6 +106,16 @@ class PrioritizedSampler:
     def nbytes(self) -> int:
         return self._tree.nbytes
 
+    @property
+    def largest(self) -> float:
+        return self._largest
+
+    def raise_largest(self, priority: float) -> None:
+        self._largest = max(self._largest, priority)
+
+    def shares(self, keys: range) -> Float64Array:
+        return self._tree.get(self._slots(_array(keys)))
+
     def insert(self, keys: range, priorities: Float32Array) -> None:
         unknown = np.full(len(keys), self._largest, np.float32)
         self._set(_array(keys), priorities if len(priorities) else unknown)
@@ -118,6 +148,14 @@ class PrioritizedSampler:
         drawable = np.flatnonzero(self._tree.get(every))
         if not np.array_equal(drawable, np.sort(self._slots(_array(keys)))):
             raise AssertionError("the transitions that can be drawn are not those of the table")
+
+
+def priorities_of(shares: Float64Array, exponent: float) -> Float32Array:
+    """The absolute TD errors [N] that gave these shares [N]; none [0] where all were made alike."""
+    if exponent == 0:
+        return np.empty(0, np.float32)
+    errors = shares ** (1 / exponent) - _EPSILON
+    return np.maximum(errors, 0.0).astype(np.float32)
 
 
 def _array(keys: range) -> Int64Array:

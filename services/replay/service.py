@@ -20,6 +20,7 @@ from common.wire import SampleRequest, decode, encode, encode_parts
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
 from services.replay.sequence import Arrival, SequenceBook
+from services.replay.snapshot import Snapshot, SnapshotWriter, read_snapshot
 from services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
@@ -61,13 +62,17 @@ class ReplayService:
         priorities: _Server,
         log: SegmentLog | None = None,
     ) -> None:
-        """log: what outlives the process; None: nothing does."""
+        """log: what outlives the process, with a snapshot beside it; None: nothing does."""
         self._config = config
         self._table = table
         self._limiter = limiter
         self._log = log
+        period_s = config.replay.snapshot_period_s
+        self._snapshots = (
+            None if log is None else SnapshotWriter(log.directory, self.snapshot, period_s)
+        )
         self._book = SequenceBook()
-        self._earlier = 0  # transitions of earlier processes that were evicted
+        self._earlier = {"inserts": 0, "samples": 0}  # that the limiter does not count
         self._changed = threading.Condition()
         self._stopping = threading.Event()
         self._counts = dict.fromkeys(_COUNTS, 0)
@@ -81,7 +86,7 @@ class ReplayService:
         ]
 
     def recover(self) -> None:
-        """Take in what the log kept of earlier processes; before `start`."""
+        """Take in what the log and a snapshot kept of earlier processes; before `start`."""
         if self._log is None:
             return
         self._table.number_from(self._log.first_key)
@@ -98,11 +103,32 @@ class ReplayService:
             _LOG.warning("%d chunks of the log are left out, the last: %s", count, left_out)
         self._forget()
         self._limiter.resume(len(self._table))
-        self._earlier = self._table.next_key - len(self._table)
+        evicted = self._table.next_key - len(self._table)
+        self._earlier = {
+            "inserts": evicted,
+            "samples": round(evicted * self._limiter.samples_per_insert),
+        }
+        snapshot = read_snapshot(self._log.directory)
+        if snapshot is not None and snapshot.restore(self._config, self._table, self._limiter):
+            self._earlier = {
+                "inserts": self._table.next_key - self._limiter.inserts,
+                "samples": snapshot.all_samples - self._limiter.samples,
+            }
+
+    def snapshot(self) -> Snapshot:
+        """What a snapshot's file is to hold now."""
+        with self._changed:
+            return Snapshot.take(self._config, self._table, self._limiter, self._all_samples)
+
+    @property
+    def _all_samples(self) -> int:
+        return self._earlier["samples"] + self._limiter.samples
 
     def start(self) -> None:
         for thread in self._threads:
             thread.start()
+        if self._snapshots is not None:
+            self._snapshots.start()
 
     def stop(self) -> None:
         """Answer what is being served, then end all threads."""
@@ -111,11 +137,14 @@ class ReplayService:
             self._changed.notify_all()
         for thread in self._threads:
             thread.join()
+        if self._snapshots is not None:
+            self._snapshots.stop()
 
     @property
     def healthy(self) -> bool:
         """All threads live; one that died of a bug of ours ends the service."""
-        return all(thread.is_alive() for thread in self._threads)
+        snapshots = self._snapshots is None or self._snapshots.healthy
+        return snapshots and all(thread.is_alive() for thread in self._threads)
 
     def metrics(self) -> dict[str, float]:
         with self._changed:
@@ -123,9 +152,8 @@ class ReplayService:
                 "size": len(self._table),
                 "capacity": self._table.capacity,
                 "min_size": self._limiter.min_size,
-                "inserts": self._earlier + self._limiter.inserts,
-                "samples": self._limiter.samples
-                + round(self._earlier * self._limiter.samples_per_insert),
+                "inserts": self._earlier["inserts"] + self._limiter.inserts,
+                "samples": self._all_samples,
                 "samples_per_insert": self._limiter.ratio,
                 "bytes": self._table.nbytes,
                 **self._counts,

@@ -93,6 +93,15 @@ class Table:
         return range(self.first_key, self._next_key)
 
     @property
+    def sampler(self) -> Sampler:
+        """Which says what is drawn."""
+        return self._sampler
+
+    def rewards(self, keys: range) -> Float32Array:
+        """A copy of these transitions' n-step returns [len(keys)]."""
+        return self._rewards[np.arange(keys.start, keys.stop) % self._capacity]
+
+    @property
     def capacity(self) -> int:
         return self._capacity
 
