@@ -118,13 +118,13 @@ class PrioritizedSampler:
 
     def insert(self, keys: range, priorities: Float32Array) -> None:
         unknown = np.full(len(keys), self._largest, np.float32)
-        self._set(_array(keys), priorities if len(priorities) else unknown)
+        self._fill(keys, self._shares(priorities if len(priorities) else unknown))
 
     def evict(self, keys: range) -> None:
-        self._tree.set(self._slots(_array(keys)), np.zeros(len(keys)))
+        self._fill(keys, np.zeros(len(keys)))
 
     def update(self, keys: Int64Array, priorities: Float32Array) -> int:
-        self._set(keys, priorities)
+        self._tree.set(self._slots(keys), self._shares(priorities))
         return len(keys)
 
     def sample(self, keys: range, size: int) -> tuple[Int64Array, Float64Array]:
@@ -132,12 +132,19 @@ class PrioritizedSampler:
         drawn = keys.start + (slots - keys.start) % len(self._tree)
         return drawn, self._tree.get(slots) / self._tree.total
 
-    def _set(self, keys: Int64Array, priorities: Float32Array) -> None:
-        if len(keys) == 0:
-            return
+    def _shares(self, priorities: Float32Array) -> Float64Array:
+        """Of the sum, by the priorities; the largest of which is remembered."""
         exact = priorities.astype(np.float64)
-        self._tree.set(self._slots(keys), (exact + _EPSILON) ** self._exponent)
-        self._largest = max(self._largest, float(exact.max()))
+        self._largest = max(self._largest, float(exact.max(initial=0.0)))
+        shares: Float64Array = (exact + _EPSILON) ** self._exponent
+        return shares
+
+    def _fill(self, keys: range, shares: Float64Array) -> None:
+        """Set the shares of consecutive keys, whose slots may go on at the first."""
+        start = keys.start % len(self._tree)
+        before_end = len(self._tree) - start
+        self._tree.fill(start, shares[:before_end])
+        self._tree.fill(0, shares[before_end:])
 
     def _slots(self, keys: Int64Array) -> Int64Array:
         return keys % len(self._tree)

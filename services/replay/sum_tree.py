@@ -45,13 +45,36 @@ class SumTree:
         Raises ValueError for a value that is negative or not finite, or an index that is none.
         """
         self._check(indices)
-        if not (np.isfinite(values).all() and (values >= 0).all()):
-            raise ValueError("a value is negative or not finite")
+        _check_values(values)
         nodes = indices + self._first_leaf
         self._nodes[nodes] = values
         for _ in range(self._depth):
             nodes >>= 1
             self._nodes[nodes] = self._nodes[2 * nodes] + self._nodes[2 * nodes + 1]
+
+    def fill(self, start: int, values: Float64Array) -> None:
+        """Put values, float64 [N], at the indices start ... start + N - 1.
+
+        Several times faster than `set`: of each level the nodes above them lie side by side.
+        Raises ValueError as `set` does.
+        """
+        if len(values) == 0:
+            return
+        self._check(np.array([start, start + len(values) - 1]))
+        _check_values(values)
+        first, last = start + self._first_leaf, start + self._first_leaf + len(values) - 1
+        nodes = self._nodes
+        nodes[first : last + 1] = values
+        for _ in range(self._depth):
+            first, last = first >> 1, last >> 1
+            if first == last:
+                nodes[first] = nodes[2 * first] + nodes[2 * first + 1]
+            else:
+                lefts, rights = (
+                    nodes[2 * first : 2 * last + 1 : 2],
+                    nodes[2 * first + 1 : 2 * last + 2 : 2],
+                )
+                nodes[first : last + 1] = lefts + rights
 
     def sample(self, uniforms: Float64Array) -> Int64Array:
         """As many indices as there are uniform numbers in 0 ... 1 (1 excluded), stratified.
@@ -86,6 +109,11 @@ class SumTree:
             raise AssertionError("a node is not the sum of its children")
         if (self._nodes < 0).any() or self._nodes[self._first_leaf + self._size :].any():
             raise AssertionError("a value is negative, or lies beyond the last index")
+
+
+def _check_values(values: Float64Array) -> None:
+    if not (np.isfinite(values).all() and (values >= 0).all()):
+        raise ValueError("a value is negative or not finite")
 
 
 def _below(targets: Float64Array, sums: Float64Array) -> Float64Array:

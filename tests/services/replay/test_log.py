@@ -74,9 +74,7 @@ def test_a_torn_tail_is_cut_off_and_the_log_goes_on(
     assert recover(open_log(directory)) == [PAYLOADS[0], b"new"]
 
 
-def test_zeros_at_the_end_are_a_torn_tail(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_zeros_at_the_end_are_a_torn_tail(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What a power cut leaves of a file that grew, but whose bytes were not on the disk yet."""
     write(tmp_path, PAYLOADS[:2])
     (segment,) = segments(tmp_path)

@@ -37,6 +37,13 @@ class TreeAgainstList(RuleBasedStateMachine):
         for index, value in zip(indices, values, strict=True):
             self.model[index] = value
 
+    @rule(data=st.data())
+    def fill(self, data: st.DataObject) -> None:
+        start = data.draw(st.integers(0, len(self.model) - 1))
+        values = data.draw(st.lists(VALUES, max_size=len(self.model) - start))
+        self.tree.fill(start, np.array(values, np.float64))
+        self.model[start : start + len(values)] = values
+
     @rule(uniforms=st.lists(BELOW_ONE, min_size=1, max_size=12))
     def sample(self, uniforms: list[float]) -> None:
         if not any(self.model):
@@ -109,6 +116,25 @@ def test_what_is_no_value_or_index_is_refused_and_changes_nothing(
     with pytest.raises(ValueError, match=reason):
         tree.set(np.array(indices), np.array(values))
     assert tree.get(np.arange(4)).tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("start", "values", "reason"),
+    [
+        (3, [1.0, 1.0], "outside 0 ... 3"),
+        (-1, [1.0], "outside 0 ... 3"),
+        (0, [1.0, math.inf], "negative or not finite"),
+        (2, [-1.0], "negative or not finite"),
+    ],
+)
+def test_what_cannot_be_filled_is_refused_and_changes_nothing(
+    start: int, values: list[float], reason: str
+) -> None:
+    tree = tree_of([1.0, 2.0, 3.0, 4.0])
+    with pytest.raises(ValueError, match=reason):
+        tree.fill(start, np.array(values))
+    assert tree.get(np.arange(4)).tolist() == [1.0, 2.0, 3.0, 4.0]
+    tree.check_invariants()
 
 
 def test_a_tree_has_a_leaf() -> None:
