@@ -12,6 +12,7 @@ _COMMANDS = {
     "report": ("services.evaluator.report", "the pictures and the film of a run"),
     "config": ("services.configure", "print the resolved configuration"),
     "replay": ("services.replay.__main__", "serve the replay table of a run"),
+    "replay inspect": ("services.replay.inspect", "what the replay log of a run holds"),
     "actor": ("services.actor.__main__", "collect for a run that is up"),
     "learner": ("services.learner.__main__", "learn for a run that is up"),
     "evaluator": ("services.evaluator.__main__", "judge the live weights of a run that is up"),
@@ -24,16 +25,17 @@ def main() -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
         return 0 if arguments else 2
-    name = arguments[0]
+    words = 2 if " ".join(arguments[:2]) in _COMMANDS else 1
+    name = " ".join(arguments[:words])
     if name not in _COMMANDS:
         sys.stderr.write(f"mrcdrl: no command {name!r}; there are {', '.join(_COMMANDS)}\n")
         return 2
     command = importlib.import_module(_COMMANDS[name][0])
-    return run_main(lambda: command.main(arguments[1:]))
+    return run_main(lambda: command.main(arguments[words:]))
 
 
 def _usage() -> str:
-    lines = [f"  {name:<10} {text}" for name, (_, text) in _COMMANDS.items()]
+    lines = [f"  {name:<14} {text}" for name, (_, text) in _COMMANDS.items()]
     head = "usage: mrcdrl COMMAND …   (mrcdrl COMMAND --help for its flags)"
     return "\n".join([head, "", *lines])
 

@@ -44,6 +44,9 @@ from services.dashboard.summary import summary
 from services.evaluator.navigation import Navigation, RobotNavigation
 from services.learner.meter import Meter
 from services.replay.__main__ import build
+from services.replay.contents import Contents
+from services.replay.digest import digest
+from services.replay.export import arrays
 from services.replay.service import ReplayService
 
 ROOT = Path(__file__).parents[1]
@@ -314,23 +317,48 @@ def test_measures_of_navigation_are_documented() -> None:
     assert [name for name in described if not name.startswith("field")] == measured
 
 
+# -- replay's log ------------------------------------------------------------------------
+
+
+def test_what_inspect_says_is_documented() -> None:
+    text = part(page("inspect.md"), "## JSON")
+    said = digest(Contents())
+    assert names(text) == ["log", *said, *said["files"]]
+
+
+def test_exported_arrays_are_documented() -> None:
+    records = np.zeros((3, 4), np.uint8)
+    octets, floats = np.ones(1, np.uint8), np.ones(1, np.float32)
+    chunk = Chunk("a", 1, 0, 0, records, octets, floats, floats, octets, floats)
+    exported = arrays(Contents(keys=[0], chunks=[chunk]))
+    described = rows(part(page("inspect.md"), "## Arrays"))
+    assert [row[0].strip("`") for row in described] == list(exported)
+    for row in described:
+        array = exported[row[0].strip("`")]
+        dtype, shape = row[1].split(" ", 1)
+        assert dtype == ("text" if array.dtype.kind == "U" else array.dtype.name)
+        assert len([n for n in shape.strip("[]").split(", ") if n]) == array.ndim
+
+
 # -- commands ----------------------------------------------------------------------------
 
 
 def test_every_command_is_in_the_readme() -> None:
-    described = {name.split()[1] for name in names(part(README, "## Commands"))}
+    described = {name.removeprefix("mrcdrl ") for name in names(part(README, "## Commands"))}
     assert described == set(cli._COMMANDS)
 
 
 def command_lines() -> list[str]:
-    """Lines of the README that begin with mrcdrl, in blocks of shell."""
-    blocks = re.findall(r"```sh\n(.*?)```", README, re.S)
+    """Lines of the README and the docs that begin with mrcdrl, in blocks of shell."""
+    text = "\n".join([README, *(path.read_text("utf-8") for path in sorted(DOCS.glob("*.md")))])
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.S)
     return [line for block in blocks for line in block.splitlines() if line.startswith("mrcdrl ")]
 
 
 @pytest.mark.parametrize("line", command_lines())
 def test_command_and_its_flags_exist(line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    name = line.split()[1]
+    words = line.split()[1:]
+    name = " ".join(words[:2]) if " ".join(words[:2]) in cli._COMMANDS else words[0]
     assert name in cli._COMMANDS
     command = importlib.import_module(cli._COMMANDS[name][0])
     with pytest.raises(SystemExit) as ended:

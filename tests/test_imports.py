@@ -38,7 +38,12 @@ PLACES = {
     "matplotlib": ("services/dashboard",),
     "av": ("services/dashboard",),
     "tensorboardX": ("services/dashboard",),
-    "rich": ("services/dashboard", "services/train", "services/evaluator"),
+    "rich": (
+        "services/dashboard",
+        "services/train",
+        "services/evaluator",
+        "services/replay/inspect.py",
+    ),
 }
 
 # The dashboard is no process: the launcher shows and records a run by its modules, and the

@@ -93,14 +93,17 @@ def open_log(config: Config, directory: Path) -> SegmentLog | None:
     )
 
 
-def build(config: Config) -> tuple[Table, RateLimiter]:
-    """The table and limiter a configuration asks for."""
+def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, RateLimiter]:
+    """The table and limiter a configuration asks for.
+
+    record_bytes: kept of each record, if not all of it.
+    """
     table = Table(
         capacity=config.replay.capacity,
         stack=config.arena.stack,
         n_step=config.agent.n_step,
         chunk_length=config.actor.chunk_length,
-        record_bytes=config.arena.record_bytes,
+        record_bytes=config.arena.record_bytes if record_bytes is None else record_bytes,
         sampler=make_sampler(config.replay),
     )
     limiter = RateLimiter.with_tolerance(
