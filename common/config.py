@@ -186,6 +186,9 @@ class ReplayConfig(Section):
     """Transitions; the oldest are replaced. (paper)"""
     min_size: Count = 50_000
     """Transitions before the first sample is given. (paper)"""
+    shards: Count = 1
+    """Replay processes that share capacity and min_size; an actor inserts into one, the learner
+    samples from all. (ours)"""
     sampler: Literal["uniform", "prioritized"] = "uniform"
     """`uniform`: each transition as likely as any other. `prioritized`: in proportion to its last
     absolute TD error, to the power priority_exponent. (paper; Ape-X: prioritized)"""
@@ -222,6 +225,16 @@ class ReplayConfig(Section):
                 "sampling would never start"
             )
         return self
+
+    @property
+    def shard_capacity(self) -> int:
+        """Transitions of one shard."""
+        return -(-self.capacity // self.shards)
+
+    @property
+    def shard_min_size(self) -> int:
+        """Transitions of one shard before its first sample."""
+        return -(-self.min_size // self.shards)
 
     @property
     def prioritized(self) -> bool:
@@ -360,10 +373,11 @@ class Config(Section):
                 f"{self.transport.timeout_s:g}: a request held would look like one unanswered"
             )
         smallest = self.learner.batch_size
-        if self.replay.min_size < smallest:
+        if self.replay.shard_min_size < smallest:
+            shares = f" over {self.replay.shards} shards" if self.replay.shards > 1 else ""
             raise ValueError(
-                f"replay.min_size {self.replay.min_size} is below learner.batch_size {smallest}: "
-                "the first batch would repeat transitions"
+                f"replay.min_size {self.replay.min_size}{shares} is below learner.batch_size "
+                f"{smallest}: the first batch would repeat transitions"
             )
         return self
 

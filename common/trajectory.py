@@ -92,6 +92,7 @@ class Samples:
     keys: Int64Array  # [B], names the transition for a priority update
     probabilities: Float64Array  # [B], of having been drawn
     table_size: int  # transitions in the table when drawn
+    total_priority: float  # of them, to the power alpha; their number where sampling is uniform
     actions: UInt8Array  # [B]
     rewards: Float32Array  # [B]
     discounts: Float32Array  # [B]

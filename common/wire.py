@@ -87,6 +87,8 @@ def _check_samples(samples: Samples) -> str | None:
         return "arrays differ in length"
     if not ((samples.probabilities > 0).all() and (samples.probabilities <= 1).all()):
         return "a probability is not above 0 and at most 1"
+    if not 0 < samples.total_priority < math.inf:
+        return "total_priority is not above 0 and finite"
     return None
 
 
@@ -107,7 +109,7 @@ _SCHEMAS: dict[type, str] = {
     Chunk: "chunk/1",
     InsertReply: "insert_reply/1",
     SampleRequest: "sample_request/1",
-    Samples: "samples/1",
+    Samples: "samples/2",
     Priorities: "priorities/1",
     PrioritiesReply: "priorities_reply/1",
     Weights: "weights/1",

@@ -13,6 +13,7 @@ _COMMANDS = {
     "config": ("services.configure", "print the resolved configuration"),
     "replay": ("services.replay.__main__", "serve the replay table of a run"),
     "replay inspect": ("services.replay.inspect", "what the replay log of a run holds"),
+    "router": ("services.router.__main__", "relay between the processes of runs"),
     "actor": ("services.actor.__main__", "collect for a run that is up"),
     "learner": ("services.learner.__main__", "learn for a run that is up"),
     "evaluator": ("services.evaluator.__main__", "judge the live weights of a run that is up"),

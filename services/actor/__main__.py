@@ -30,7 +30,7 @@ from common.wire import encode
 from services.actor.chunker import Origin
 from services.actor.collector import Collector
 from services.actor.sender import Sender
-from services.replay.client import ReplayWriter
+from services.replay.client import ReplayWriter, shard_of
 
 _LOG = logging.getLogger("actor")
 
@@ -43,7 +43,15 @@ def main(argv: Sequence[str]) -> int:
         config = fetch_config(session, joining, stop)
         torch.set_num_threads(config.actor.threads)
         session.announce(joining.keys.live("actor", joining.worker))
-        writer = ReplayWriter(bulk, joining.keys, config.actor.warn_s, stop)
+        num_shards = config.replay.shards
+        writer = ReplayWriter(
+            bulk,
+            joining.keys,
+            config.actor.warn_s,
+            stop,
+            shard=shard_of(joining.worker, num_shards),
+            num_shards=num_shards,
+        )
         sender = Sender(writer, config.actor.spool_chunks)
         try:
             Actor(config, joining, session, sender).run(stop)

@@ -54,6 +54,8 @@ def main(argv: Sequence[str]) -> int:
             settings.requests_in_flight,
             settings.warn_s,
             stop,
+            num_shards=config.replay.shards,
+            seed=settings.seed,
         )
         prefetcher = Prefetcher(
             reader, make_collate(config, learner), settings.prefetch_batches, stop
@@ -61,7 +63,8 @@ def main(argv: Sequence[str]) -> int:
         priorities = None
         if config.replay.prioritized:
             priorities = PrioritiesSender(
-                PriorityWriter(bulk, keys, stop), settings.prefetch_batches
+                PriorityWriter(bulk, keys, stop, num_shards=config.replay.shards),
+                settings.prefetch_batches,
             )
         writer = WeightsWriter(session, keys)
         reporter = StatsReporter(

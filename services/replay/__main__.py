@@ -36,26 +36,30 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
     parser.add_argument("--listen", action="append", help="endpoint, such as tcp/127.0.0.1:7447")
     parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
-    parser.add_argument("--id", default="replay-0", help="this worker's name")
+    parser.add_argument("--shard", type=int, default=0, help="which of replay.shards, from 0")
+    parser.add_argument("--id", help="this worker's name; by default from the shard")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
     run_dir = arguments.run_dir / check_name(arguments.run, "run name")
     config = load_config(arguments.config or config_of(run_dir), overrides(arguments))
-    listen = tuple(arguments.listen or config.transport.listen)
-    connect = tuple(arguments.connect or config.transport.connect)
+    listen, connect = tuple(arguments.listen or ()), tuple(arguments.connect or ())
+    if not (listen or connect):
+        listen, connect = config.transport.listen, config.transport.connect
     if not (listen or connect):
         listen = (noted_endpoint(run_dir, "--listen"),)
     transport = config.transport.model_copy(update={"listen": listen, "connect": connect})
-    keys = Keys(arguments.run)
-    worker = check_name(arguments.id, "--id")
+    keys, shard = Keys(arguments.run), arguments.shard
+    if not 0 <= shard < config.replay.shards:
+        parser.error(f"--shard {shard}: the run has {config.replay.shards} (replay.shards)")
+    worker = check_name(arguments.id or f"replay-{shard}", "--id")
     stop = StopSignal().listen(STOP_DEADLINE_S)
     table, limiter = build(config)
-    log = open_log(config, run_dir / "replay" / "0")
+    log = open_log(config, run_dir / "replay" / str(shard))
     with Session(transport) as session:
         configs = session.server(keys.config)
-        inserts, samples = session.server(keys.insert()), session.server(keys.sample())
-        priorities = session.server(keys.priorities())
+        inserts, samples = session.server(keys.insert(shard)), session.server(keys.sample(shard))
+        priorities = session.server(keys.priorities(shard))
         reporter = StatsReporter(session.publisher(keys.stats("replay", worker)), "replay", worker)
         service = ReplayService(config, table, limiter, inserts, samples, priorities, log)
         service.recover()
@@ -99,7 +103,7 @@ def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, Ra
     record_bytes: kept of each record, if not all of it.
     """
     table = Table(
-        capacity=config.replay.capacity,
+        capacity=config.replay.shard_capacity,
         stack=config.arena.stack,
         n_step=config.agent.n_step,
         chunk_length=config.actor.chunk_length,
@@ -108,7 +112,7 @@ def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, Ra
     )
     limiter = RateLimiter.with_tolerance(
         config.replay.samples_per_insert,
-        config.replay.min_size,
+        config.replay.shard_min_size,
         config.replay.tolerance,
         largest_insert=config.actor.chunk_length,
         largest_sample=config.learner.sample_size,
@@ -120,7 +124,7 @@ def make_sampler(replay: ReplayConfig) -> Sampler:
     """The sampler a configuration asks for."""
     rng = np.random.default_rng(replay.seed)
     if replay.prioritized:
-        return PrioritizedSampler(replay.capacity, replay.priority_exponent, rng)
+        return PrioritizedSampler(replay.shard_capacity, replay.priority_exponent, rng)
     return UniformSampler(rng)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -14,8 +13,11 @@ from common.framing import join_set
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples
-from common.transport import PendingReply, Session
+from common.transport import Client, PendingReply, Session
 from common.wire import SampleRequest, decode, encode, encode_parts
+from services.replay.shards import ShardStream, shard_of, shares
+
+__all__ = ["PriorityWriter", "ReplayReader", "ReplayWriter", "shard_of", "split_samples"]
 
 _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2
@@ -25,11 +27,22 @@ _LAST_ANSWER_S = 1.0  # for an answer under way when told to stop
 class ReplayWriter:
     """Inserts chunks; returns when replay has acknowledged, however often it must ask.
 
-    warn_s: without an acknowledgement for so long, a line of the log says so.
+    warn_s: without an acknowledgement for so long, a line of the log says so. shard: of
+    num_shards, the one that takes this actor's chunks.
     """
 
-    def __init__(self, session: Session, keys: Keys, warn_s: float, stop: StopSignal) -> None:
-        self._client = session.client(keys.insert(), "replay", lends=True)
+    def __init__(
+        self,
+        session: Session,
+        keys: Keys,
+        warn_s: float,
+        stop: StopSignal,
+        *,
+        shard: int = 0,
+        num_shards: int = 1,
+    ) -> None:
+        name = _names(num_shards)[shard]
+        self._client = session.client(keys.insert(shard), name, lends=True)
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
 
@@ -58,7 +71,12 @@ class ReplayWriter:
 
 
 class ReplayReader:
-    """Samples mini-batches, several requests ahead, several batches a request."""
+    """Samples mini-batches from all shards, several requests ahead, several batches a request.
+
+    A reply is of one shard, drawn in proportion to the shards' total priorities; the
+    probabilities, the table size and the keys of its samples speak of all shards together. One
+    that is away or holds back is left out until it answers.
+    """
 
     def __init__(
         self,
@@ -69,16 +87,24 @@ class ReplayReader:
         requests_in_flight: int,
         warn_s: float,
         stop: StopSignal,
+        *,
+        num_shards: int = 1,
+        seed: int = 0,
     ) -> None:
-        self._client = session.client(keys.sample(), "replay", lends=True)
+        payload = encode(SampleRequest(batch_size * batches_per_request))
+        self._shards = [
+            ShardStream(
+                session.client(keys.sample(shard), name, lends=True),
+                name,
+                payload,
+                requests_in_flight,
+            )
+            for shard, name in enumerate(_names(num_shards))
+        ]
         self._batch_size = batch_size
-        self._payload = encode(SampleRequest(batch_size * batches_per_request))
-        self._in_flight = requests_in_flight
-        self._pending: deque[PendingReply] = deque()
-        self._reply: PendingReply | None = None  # whose batches are being given out
-        self._reply_bytes = 0
         self._batches: Iterator[Samples] = iter(())
         self._patience = _Patience("replay has not answered with a mini-batch", warn_s)
+        self._rng = np.random.default_rng(seed)
         self._stop = stop
 
     def sample(self) -> Samples | None:
@@ -87,57 +113,90 @@ class ReplayReader:
         Raises RefusedError, with replay's reason, when asking again would not help.
         """
         batch = next(self._batches, None)
-        while batch is None and self._ask():
+        self._patience.renew()
+        while batch is None and not self._stop.is_set():
+            self._batches = self._next_batches()
             batch = next(self._batches, None)
         return batch
 
-    def _ask(self) -> bool:
-        """Wait for the batches of the next reply; False when stopped before it came."""
-        if self._reply is not None:
-            self._reply.release()
-            self._reply = None
-        self._patience.renew()
-        while not self._stop.is_set():
-            while len(self._pending) < self._in_flight:
-                asked = self._client.ask(self._payload, reply_bytes=self._reply_bytes)
-                self._pending.append(asked)
-            pending = self._pending.popleft()
-            if not _answered(pending, self._stop):
-                break
-            try:
-                payload = pending.result()
-                samples = decode(Samples, payload)
-            except HeldError:
-                self._patience.renew()
-            except DeadlineError:
-                self._patience.spend()
-                self._stop.wait(_RETRY_S)
-            else:
-                self._reply, self._reply_bytes = pending, len(payload)
-                self._batches = split_samples(samples, self._batch_size)
-                return True
-        return False
+    def _next_batches(self) -> Iterator[Samples]:
+        """Those of the next reply; none where no shard had one in time."""
+        there = [s for s in self._shards if s.ready() or not s.late] or self._shards
+        share = shares([shard.total_priority for shard in there])
+        index = int(self._rng.choice(len(there), p=share)) if len(there) > 1 else 0
+        drawn = there[index]
+        if not drawn.ready(_RETRY_S):
+            drawn.late = True
+            return iter(())
+        try:
+            samples = drawn.take()
+        except HeldError:
+            self._patience.renew()
+            return iter(())
+        except DeadlineError:
+            self._patience.spend()
+            self._stop.wait(_RETRY_S)
+            return iter(())
+        if len(self._shards) > 1:
+            samples = self._of_all(samples, self._shards.index(drawn), float(share[index]))
+        return split_samples(samples, self._batch_size)
+
+    def _of_all(self, samples: Samples, shard: int, share: float) -> Samples:
+        """A shard's samples as those of the table that all shards are together."""
+        return dataclasses.replace(
+            samples,
+            keys=samples.keys * len(self._shards) + shard,
+            probabilities=samples.probabilities * share,
+            table_size=sum(stream.table_size for stream in self._shards),
+            total_priority=sum(stream.total_priority or 0.0 for stream in self._shards),
+        )
 
 
 class PriorityWriter:
     """Sets priorities; each is tried once, since a lost one does no harm."""
 
-    def __init__(self, session: Session, keys: Keys, stop: StopSignal) -> None:
-        self._client = session.client(keys.priorities(), "replay")
+    def __init__(
+        self, session: Session, keys: Keys, stop: StopSignal, *, num_shards: int = 1
+    ) -> None:
+        self._clients = [
+            session.client(keys.priorities(shard), name)
+            for shard, name in enumerate(_names(num_shards))
+        ]
         self._stop = stop
 
     def update(self, priorities: Priorities) -> PrioritiesReply | None:
-        """The acknowledgement; None where replay is away or busy, or told to stop.
+        """The acknowledgement; None where a shard is away or busy, or told to stop.
 
         Raises RefusedError, with replay's reason, when the message is wrong.
         """
-        pending = self._client.ask(encode(priorities))
+        pending = [client.ask(encode(part)) for client, part in self._parts(priorities)]
+        replies = [self._reply(asked) for asked in pending]
+        there = [reply for reply in replies if reply is not None]
+        if len(there) < len(replies):
+            return None
+        return PrioritiesReply(sum(r.updated for r in there), sum(r.ignored for r in there))
+
+    def _parts(self, priorities: Priorities) -> Iterator[tuple[Client, Priorities]]:
+        """Whom to tell what."""
+        num_shards = len(self._clients)
+        for shard, client in enumerate(self._clients):
+            here = priorities.keys % num_shards == shard
+            if here.any():
+                keys = priorities.keys[here] // num_shards
+                yield client, Priorities(keys, priorities.priorities[here])
+
+    def _reply(self, pending: PendingReply) -> PrioritiesReply | None:
         if not _answered(pending, self._stop):
             return None
         try:
             return decode(PrioritiesReply, pending.result())
         except (HeldError, DeadlineError, WireError):
             return None
+
+
+def _names(num_shards: int) -> list[str]:
+    """The shards' names, for errors and the log."""
+    return [f"replay shard {i}" for i in range(num_shards)] if num_shards > 1 else ["replay"]
 
 
 def split_samples(samples: Samples, batch_size: int) -> Iterator[Samples]:

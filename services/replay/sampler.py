@@ -51,6 +51,10 @@ class Sampler(Protocol):
         """`size` of the table's keys, with replacement, and their probabilities, both [size]."""
         ...
 
+    def total(self, keys: range) -> float:
+        """What the probabilities are shares of, over the table's keys."""
+        ...
+
     def check_invariants(self, keys: range) -> None:
         """Raise AssertionError where what is kept does not fit the table's keys."""
         ...
@@ -83,6 +87,9 @@ class UniformSampler:
     def sample(self, keys: range, size: int) -> tuple[Int64Array, Float64Array]:
         drawn = keys.start + self._rng.integers(0, len(keys), size)
         return drawn, np.full(size, 1.0 / len(keys))
+
+    def total(self, keys: range) -> float:
+        return float(len(keys))
 
     def check_invariants(self, keys: range) -> None:
         pass
@@ -131,6 +138,9 @@ class PrioritizedSampler:
         slots = self._tree.sample(self._rng.random(size))
         drawn = keys.start + (slots - keys.start) % len(self._tree)
         return drawn, self._tree.get(slots) / self._tree.total
+
+    def total(self, keys: range) -> float:
+        return self._tree.total
 
     def _shares(self, priorities: Float32Array) -> Float64Array:
         """Of the sum, by the priorities; the largest of which is remembered."""

@@ -180,6 +180,7 @@ class Table:
             keys=keys,
             probabilities=probabilities,
             table_size=len(self),
+            total_priority=self._sampler.total(self.keys),
             actions=self._actions[slots],
             rewards=self._rewards[slots],
             discounts=self._discounts[slots],

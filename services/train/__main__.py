@@ -100,7 +100,7 @@ def supervise(
     """Run all services until stopped or the rule says so; the reason."""
     config, keys = run.config, Keys(run.path.name)
     state, rule = RunState(config), StoppingRule(config.run)
-    fleet.start("replay", "replay-0", replay_arguments(run, endpoint))
+    start_replay(run, fleet, endpoint)
     with join(fleet, transport(config, endpoint)) as session:
         run.note_endpoint(endpoint)
         follower = Follower(session, keys, state, recorder, rule)
@@ -146,11 +146,21 @@ def join(fleet: Fleet, transport: TransportConfig) -> Session:
                 raise
 
 
-def replay_arguments(run: RunDirectory, endpoint: str) -> list[str]:
-    config_path = str(run.path / RUN_CONFIG)
-    run_dir = str(run.path.parent)
-    name = run.path.name
-    return ["--run", name, "--config", config_path, "--listen", endpoint, "--run-dir", run_dir]
+def start_replay(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
+    """One replay process that listens itself, or several shards that a router joins."""
+    num_shards = run.config.replay.shards
+    if num_shards > 1:
+        fleet.start("router", "router-0", ["--listen", endpoint])
+    for shard in range(num_shards):
+        fleet.start("replay", f"replay-{shard}", replay_arguments(run, endpoint, shard))
+
+
+def replay_arguments(run: RunDirectory, endpoint: str, shard: int) -> list[str]:
+    end = "--listen" if run.config.replay.shards == 1 else "--connect"
+    return [
+        *("--run", run.path.name, "--run-dir", str(run.path.parent)),
+        *("--config", str(run.path / RUN_CONFIG), "--shard", str(shard), end, endpoint),
+    ]
 
 
 def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:

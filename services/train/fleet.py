@@ -29,7 +29,7 @@ _TERM_S = 20.0  # until a service that was asked to stop is killed
 _MIN_LIFE_S = 10.0  # a service that fails sooner would fail again
 _LONG_LIFE_S = 300.0  # one that lived so long may be started again as often as at first
 _MAX_RESTARTS = 3
-_STOP_ORDER = ("actor", "evaluator", "learner", "replay")
+_STOP_ORDER = ("actor", "evaluator", "learner", "replay", "router")
 
 
 @dataclass(slots=True)

@@ -20,7 +20,7 @@ from common.errors import RunDirectoryError
 from common.files import RUN_CONFIG, atomic_write, reason
 from common.process import ENDPOINT_FILE
 
-_KEPT = ("arena.", "agent.kind")  # what checkpoints and the replay log were made with
+_KEPT = ("arena.", "agent.kind", "replay.shards")  # what checkpoints and logs were made with
 
 
 def default_name(config_name: str, num_robots: int) -> str:
@@ -72,7 +72,7 @@ class RunDirectory:
         for name in overrides:
             if name.startswith(_KEPT):
                 raise RunDirectoryError(
-                    f"{path} keeps its arena and its agent, so {name} cannot be changed; "
+                    f"{path} keeps what it was made with: {name} cannot be changed; "
                     "start a new run for that"
                 )
         config = load_config(str(path / RUN_CONFIG), overrides)

@@ -33,6 +33,7 @@ def make_samples(
         keys=np.arange(count, dtype=np.int64),
         probabilities=np.full(count, 0.01),
         table_size=100,
+        total_priority=100.0,
         records=(np.arange(count)[:, None] * 16 + np.arange(width)).astype(np.uint8)[..., None],
         actions=np.array(actions or rng.integers(3, size=count), np.uint8),
         rewards=rng.normal(size=count).astype(np.float32),

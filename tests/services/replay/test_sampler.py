@@ -83,6 +83,7 @@ def samples_of(keys: Int64Array, probabilities: Float64Array) -> Samples:
         keys=keys,
         probabilities=probabilities,
         table_size=HELD,
+        total_priority=float(HELD),
         records=np.zeros((count, 1, 1), np.uint8),
         actions=np.zeros(count, np.uint8),
         rewards=np.zeros(count, np.float32),

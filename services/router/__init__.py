@@ -1,0 +1,1 @@
+"""The router: relays between the processes of runs where replay does not listen itself."""
