@@ -50,7 +50,7 @@ PLACES = {
 # evaluator's commands draw by them.
 DRAWN_BY_DASHBOARD = {
     "services/train": {"recorder", "screen", "state", "stopping"},
-    "services/evaluator": {"figures", "film"},
+    "services/evaluator": {"figures", "film", "paper"},
 }
 
 

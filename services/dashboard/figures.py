@@ -19,6 +19,8 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from common.config import ArenaConfig
+from common.errors import MrcdrlError
+from common.files import reason
 from common.trajectory import Float64Array, Outcome
 from services.dashboard.records import (
     EpisodeRecord,
@@ -69,37 +71,37 @@ def training_curve(run_dir: Path, out: Path) -> None:
     _draw_successes(successes, episodes, group)
     _draw_evaluations(evaluation, tests)
     figure.suptitle(run_dir.name, fontsize=13, fontweight="bold")
-    figure.savefig(out)
+    save(figure, out)
 
 
 def _draw_scores(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -> None:
     scores = np.array([record.episode.score for record in episodes])
-    _dress(axes, "(a) score of an episode, mean over its robots", "episodes", "score")
+    dress(axes, "(a) score of an episode, mean over its robots", "episodes", "score")
     if not episodes:
-        _say(axes, "no episode")
+        say(axes, "no episode")
     else:
         each = max(1, min(HUNDRED, len(scores) // 20))
         label = f"mean of {each} episodes" if each > 1 else "each episode"
-        axes.plot(*_means(scores, each), color=LIGHT_BLUE, lw=1.2, label=label)
+        axes.plot(*means(scores, each), color=LIGHT_BLUE, lw=1.2, label=label)
         if len(scores) >= 2 * group:
             label = f"mean of {group} episodes"
-            axes.plot(*_means(scores, group), color=DARK_BLUE, lw=2, label=label)
+            axes.plot(*means(scores, group), color=DARK_BLUE, lw=2, label=label)
         axes.legend(loc="lower right", frameon=False)
     _over_episodes(axes, episodes)
 
 
 def _draw_successes(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -> None:
     won = np.array([record.episode.outcome is Outcome.SUCCESS for record in episodes], float)
-    _dress(axes, "(b) successes per 100 episodes", "episodes", "successes")
+    dress(axes, "(b) successes per 100 episodes", "episodes", "successes")
     axes.set_ylim(-2, 112)
     if len(won) < HUNDRED:
-        _say(axes, f"{int(won.sum())} successes in {len(won)} episodes, fewer than 100")
+        say(axes, f"{int(won.sum())} successes in {len(won)} episodes, fewer than 100")
     else:
-        counted, values = _means(HUNDRED * won, HUNDRED)
+        counted, values = means(HUNDRED * won, HUNDRED)
         if group > HUNDRED:
             axes.plot(counted, values, color=LIGHT_BLUE, lw=1.2, label="each 100 episodes")
             label = f"mean of {group} episodes"
-            axes.plot(*_means(HUNDRED * won, group), color=DARK_BLUE, lw=2, label=label)
+            axes.plot(*means(HUNDRED * won, group), color=DARK_BLUE, lw=2, label=label)
         else:
             sliding = np.convolve(won, np.ones(HUNDRED), "valid")
             middles = np.arange(len(sliding)) + (HUNDRED + 1) / 2
@@ -127,12 +129,12 @@ def _over_episodes(axes: Axes, episodes: Sequence[EpisodeRecord]) -> None:
 
 def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
     title = "(c) success in the paper's test: one collision fails"
-    _dress(axes, title, "learner steps", "success, %")
+    dress(axes, title, "learner steps", "success, %")
     axes.set_ylim(-2, 112)
     tests = sorted(tests, key=lambda record: record.evaluation.learner_step)
     steps = np.array([record.evaluation.learner_step for record in tests], float)
     if not tests:
-        _say(axes, "no evaluation")
+        say(axes, "no evaluation")
     else:
         rates = 100 * np.array([record.evaluation.success_rate for record in tests])
         bounds = 100 * np.array([record.evaluation.success_interval for record in tests])
@@ -153,18 +155,18 @@ def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
     _minutes(axes, steps, [record.time_s for record in tests])
 
 
-def _means(values: Float64Array, group: int) -> tuple[Float64Array, Float64Array]:
+def means(values: Float64Array, group: int) -> tuple[Float64Array, Float64Array]:
     """Episode in the middle of each whole group, and the group's mean."""
     whole = len(values) // group
     middles: Float64Array = group * (np.arange(whole, dtype=np.float64) + 0.5) + 0.5
     return middles, values[: whole * group].reshape(whole, group).mean(axis=1)
 
 
-def _say(axes: Axes, words: str) -> None:
+def say(axes: Axes, words: str) -> None:
     axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", color="#777777")
 
 
-def _dress(axes: Axes, title: str, x: str, y: str) -> None:
+def dress(axes: Axes, title: str, x: str, y: str) -> None:
     axes.set_title(title, loc="left", fontsize=11)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -202,7 +204,7 @@ def _interpolation(x: Float64Array, y: Float64Array) -> Callable[[Any], Any]:
 
 
 def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> None:
-    """A grid of episodes as a PNG at `out` (paper Figs. 8 and 10).
+    """A grid of episodes as a picture at `out` (paper Fig. 8).
 
     Each robot's path is shaded from light (start) to dark (end) in its own hue; red circles:
     starts; blue squares: targets; red lines: the wall.
@@ -215,11 +217,19 @@ def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> 
     for axes in grid.flat:
         axes.set_axis_off()
     for axes, episode in zip(grid.flat, episodes, strict=False):
-        _draw_paths(axes, episode, config)
-    figure.savefig(out)
+        draw_paths(axes, episode, config)
+    save(figure, out)
 
 
-def _draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
+def save(figure: Figure, out: Path) -> None:
+    """Writes it in the format that the name's suffix says; raises MrcdrlError where it cannot."""
+    try:
+        figure.savefig(out)
+    except OSError as error:
+        raise MrcdrlError(f"figure {out} cannot be written: {reason(error)}") from error
+
+
+def draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
     _draw_arena(axes, episode.targets, config)
     radius = config.robot_radius_px
     for k in range(episode.robots.shape[1]):

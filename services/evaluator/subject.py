@@ -47,9 +47,19 @@ def subject_parser(command: str, description: str) -> Parser:
     parser = Parser(prog=f"mrcdrl {command}", description=description)
     parser.add_argument("weights", nargs="?", type=Path, help="a .safetensors file, or a run")
     parser.add_argument("--controller", help=f"instead of weights: {', '.join(CONTROLLERS)}")
+    add_arena_flags(parser)
+    return parser
+
+
+def add_arena_flags(parser: Parser) -> None:
+    """The flags that say in which arena a subject is shown."""
     parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
     add_config_flags(parser, {"arena.num_robots": "--robots"})
-    return parser
+
+
+def config_without_weights(arguments: argparse.Namespace) -> Config:
+    """What the flags give; the preset `quick` where none is named. Raises ConfigError."""
+    return load_config(arguments.config or "quick", overrides(arguments))
 
 
 def subject(arguments: argparse.Namespace) -> Subject:
@@ -60,12 +70,10 @@ def subject(arguments: argparse.Namespace) -> Subject:
     """
     if (arguments.weights is None) == (arguments.controller is None):
         raise ConfigError("give either weights or --controller")
-    given = overrides(arguments)
     if arguments.controller is not None:
-        config = load_config(arguments.config or "quick", given)
-        return Subject(config, None, check_controller(arguments.controller), Weights(0, 0, 0, b""))
+        return controlled(arguments.controller, config_without_weights(arguments))
     path = weights_path(arguments.weights)
-    config = load_config(arguments.config or _config_beside(path), given)
+    config = load_config(arguments.config or _config_beside(path), overrides(arguments))
     payload, manifest = _read(path)
     torch.set_num_threads(config.evaluator.threads)
     network = network_from_bytes(payload, compute_dtype=precision(config.learner.precision))
@@ -81,6 +89,11 @@ def subject(arguments: argparse.Namespace) -> Subject:
         payload=payload,
     )
     return Subject(config, Policy(network), None, weights)
+
+
+def controlled(name: str, config: Config) -> Subject:
+    """A controller in the arena of the configuration; raises ConfigError for an unknown one."""
+    return Subject(config, None, check_controller(name), Weights(0, 0, 0, b""))
 
 
 def weights_path(path: Path) -> Path:
