@@ -1,12 +1,16 @@
 """Films of episodes: the arena, what each robot sees of it, a line of words.
 
-Invariants: frames are uint8 BGR of one size; a film is H.264 that every player shows.
+Invariants: frames are uint8 BGR of one size; a film is H.264 that every player shows, or a GIF
+that every page shows: half as wide and high, every third frame. Neither is held in memory.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
+from itertools import islice
 from pathlib import Path
+from typing import Literal
 
 import av
 import matplotlib
@@ -23,26 +27,29 @@ FONT = "fonts/ttf/DejaVuSans.ttf"
 
 
 def write_film(path: Path, frames: Iterable[UInt8Array], fps: int) -> int:
-    """Writes the frames (uint8 BGR [H, W, 3], all of one size) as H.264; returns how many.
+    """Writes the frames (uint8 BGR [H, W, 3], all of one size); returns how many it has got.
 
-    An odd height or width loses its last row or column. Raises MrcdrlError when there is no
-    frame, when sizes differ, or when the file or the encoder fails.
+    The suffix chooses: .mp4 or .gif. An odd height or width loses its last row or column. Raises
+    MrcdrlError for another suffix, when there is no frame, when sizes differ, or when the file or
+    the encoder fails.
     """
+    check_suffix(path)
+    form = _FORMS[path.suffix]
     num_frames = 0
     shape: tuple[int, ...] | None = None
     try:
         with av.open(str(path), "w") as container:
-            stream = container.add_stream("libx264", rate=Fraction(fps))
-            stream.pix_fmt = "yuv420p"
-            stream.options = {"crf": "20"}
-            for frame in frames:
+            stream = container.add_stream(form.codec, rate=Fraction(fps, form.every))
+            stream.pix_fmt = form.pixels
+            stream.options = form.options
+            for frame in islice(frames, 0, None, form.every):
+                height, width = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
+                picture = form.picture(np.ascontiguousarray(frame[:height, :width]))
                 if shape is None:
                     shape = frame.shape
-                    stream.height, stream.width = shape[0] // 2 * 2, shape[1] // 2 * 2
+                    stream.height, stream.width = picture.height, picture.width
                 if frame.shape != shape:
                     raise MrcdrlError(f"film {path}: a frame is {frame.shape}, the first {shape}")
-                even = np.ascontiguousarray(frame[: stream.height, : stream.width])
-                picture = av.VideoFrame.from_ndarray(even, format="bgr24")
                 container.mux(stream.encode(picture))
                 num_frames += 1
             if num_frames:
@@ -53,6 +60,60 @@ def write_film(path: Path, frames: Iterable[UInt8Array], fps: int) -> int:
         path.unlink(missing_ok=True)
         raise MrcdrlError(f"film {path} has no frame")
     return num_frames
+
+
+def check_suffix(path: Path) -> None:
+    """Raises MrcdrlError unless films of that name can be written."""
+    if path.suffix not in _FORMS:
+        raise MrcdrlError(f"film {path}: the name ends in none of {', '.join(_FORMS)}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """How a kind of film is encoded."""
+
+    codec: Literal["libx264", "gif"]
+    pixels: str  # format of the encoder's pictures
+    options: dict[str, object]
+    every: int  # one frame of so many is kept
+    picture: Callable[[UInt8Array], av.VideoFrame]  # of a frame of even size
+
+
+def _whole(frame: UInt8Array) -> av.VideoFrame:
+    return av.VideoFrame.from_ndarray(frame, format="bgr24")
+
+
+def _small(frame: UInt8Array) -> av.VideoFrame:
+    """Half the size, in the palette's colours."""
+    half = Image.fromarray(frame[..., ::-1]).reduce(2)
+    indices = half.quantize(palette=_palette(), dither=Image.Dither.NONE)
+    argb = np.insert(_colours(), 0, 255, axis=1)
+    return av.VideoFrame.from_ndarray((np.asarray(indices), argb), format="pal8")  # type: ignore[arg-type]
+
+
+@cache
+def _colours() -> UInt8Array:
+    """The film's: greys, and red and blue on black and on white; RGB [256, 3]."""
+    greys = np.linspace((0, 0, 0), (255, 255, 255), 128)
+    ramps = [
+        np.linspace(paint, ground, 32)
+        for paint in ((255, 0, 0), (0, 0, 255))
+        for ground in ((0, 0, 0), (255, 255, 255))
+    ]
+    return np.concatenate([greys, *ramps]).astype(np.uint8)
+
+
+@cache
+def _palette() -> Image.Image:
+    image = Image.new("P", (1, 1))
+    image.putpalette(_colours().tobytes())
+    return image
+
+
+_FORMS = {
+    ".mp4": _Form("libx264", "yuv420p", {"crf": "20"}, 1, _whole),
+    ".gif": _Form("gif", "pal8", {}, 3, _small),
+}
 
 
 def compose_frame(arena_bgr: UInt8Array, views: UInt8Array, caption: str) -> UInt8Array:

@@ -101,7 +101,32 @@ def test_a_film_reads_back(tmp_path: Path, height: int, width: int) -> None:
     assert greys == sorted(greys)
 
 
+def test_a_gif_is_half_as_large_and_shows_every_third_frame(tmp_path: Path) -> None:
+    path = tmp_path / "film.gif"
+    assert write_film(path, counting_frames(20, 65, 97), 30) == 7
+    greys = []
+    with Image.open(path) as film:
+        assert (film.size, film.n_frames) == ((48, 32), 7)
+        for number in range(film.n_frames):
+            film.seek(number)
+            assert film.info["duration"] == 100
+            greys.append(np.asarray(film.convert("L")).mean())
+    np.testing.assert_allclose(greys, [30 * number for number in range(7)], atol=4)
+
+
+def test_a_gif_keeps_the_arenas_colours(tmp_path: Path) -> None:
+    """BGR in, RGB out: red walls, blue targets, white robots, grey views."""
+    colours = [(0, 0, 255), (255, 0, 0), (255, 255, 255), (76, 76, 76), (0, 0, 0)]
+    frame = np.repeat(np.array(colours, np.uint8)[None], 8, axis=0).repeat(8, axis=1)
+    write_film(tmp_path / "film.gif", [frame], 30)
+    with Image.open(tmp_path / "film.gif") as film:
+        shown = np.asarray(film.convert("RGB"))[2, 2::4]
+    np.testing.assert_allclose(shown, np.array(colours)[:, ::-1], atol=4)
+
+
 def test_films_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MrcdrlError, match=r"film.avi: the name ends in none of .mp4, .gif"):
+        write_film(tmp_path / "film.avi", counting_frames(2, 64, 64), 30)
     with pytest.raises(MrcdrlError, match="no frame"):
         write_film(tmp_path / "empty.mp4", [], 30)
     assert not (tmp_path / "empty.mp4").exists()
