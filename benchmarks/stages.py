@@ -21,6 +21,7 @@ from common.transport import Session, free_endpoint
 from services.actor.chunker import Origin
 from services.actor.collector import Collector
 from services.learner.batch import collate
+from services.learner.drawing import make_drawing
 from services.learner.learner import Learner
 from services.replay.__main__ import build
 from services.replay.client import ReplayReader, ReplayWriter
@@ -125,13 +126,13 @@ def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> d
         service.stop()
     if sampled is None:
         raise RuntimeError("no mini-batch came")
-    decode = make_codec(config.arena).decode
+    draw = make_drawing(config.arena, learner.device)
     symmetries = layout_symmetries(config.arena)
 
     def collated() -> object:
-        return collate(sampled, decode, config.arena.stack, symmetries=symmetries, rng=learner.rng)
+        return collate(sampled, draw, config.arena.stack, symmetries=symmetries, rng=learner.rng)
 
-    batch = collate(sampled, decode, config.arena.stack)
+    batch = collate(sampled, draw, config.arena.stack)
     return {
         "insert_us_per_chunk": spread([s * MICRO for s in inserts]),
         "sample_us_per_batch": spread([s * MICRO for s in samples]),

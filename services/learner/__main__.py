@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 
-from common.arena import layout_symmetries, make_codec
+from common.arena import layout_symmetries
 from common.config import Config
 from common.process import (
     STOP_DEADLINE_S,
@@ -22,6 +22,7 @@ from common.trajectory import Samples
 from common.transport import Session
 from common.weights import WeightsWriter
 from services.learner.batch import Batch, collate, importance_exponent_at
+from services.learner.drawing import make_drawing
 from services.learner.keeper import Keeper
 from services.learner.learner import Learner
 from services.learner.meter import Meter
@@ -119,17 +120,16 @@ def run(
 def make_collate(config: Config, learner: Learner) -> Callable[[Samples], Batch]:
     """From samples to the batch of one step, pictures drawn."""
     symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
-    codec = make_codec(config.arena)
+    drawing = make_drawing(config.arena, learner.device)
 
     def collate_now(samples: Samples) -> Batch:
         return collate(
             samples,
-            codec.decode,
+            drawing,
             config.arena.stack,
             symmetries=symmetries,
             rng=learner.rng,
             beta=importance_exponent_at(config.replay, learner.learner_step),
-            device=learner.device,
         )
 
     return collate_now

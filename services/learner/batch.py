@@ -1,35 +1,24 @@
 """From sampled records to the tensors of one learner step.
 
-Invariants: every record is decoded once; a transition's pictures and its action undergo the same
+Invariants: every record is drawn once; a transition's pictures and its action undergo the same
 symmetry; stacking states out of single pictures happens here only.
 
 Shapes: B = transitions, W = records a transition may touch, R = bytes of a record, S = pictures
 stacked in a state, V = width of a picture in px.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 
+from common.arena import Symmetry
 from common.config import ReplayConfig
 from common.errors import WireError
 from common.schedule import value_at
-from common.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples, UInt8Array
-
-
-class Symmetry(Protocol):
-    """A turn or mirroring of the arena, as it shows in pictures and actions."""
-
-    def apply_to_pictures(self, pictures: UInt8Array, /) -> UInt8Array:
-        """uint8 [..., V, V] to the same shape."""
-        ...
-
-    def apply_to_actions(self, actions: UInt8Array, /) -> UInt8Array:
-        """uint8 [...] to the same shape: mirrored, left is right."""
-        ...
+from common.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples
+from services.learner.drawing import Drawing, Turns
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,41 +50,36 @@ def importance_weights(samples: Samples, beta: float) -> Float32Array:
 
 def collate(
     samples: Samples,
-    decode: Callable[[UInt8Array], UInt8Array],
+    draw: Drawing,
     stack: int,
     *,
     symmetries: Sequence[Symmetry] = (),
     rng: np.random.Generator | None = None,
     beta: float = 0.0,
-    device: str | torch.device = "cpu",
 ) -> Batch:
-    """The batch of these samples.
+    """The batch of these samples, on the device of the drawing.
 
-    decode: records uint8 [B, W, R] to pictures uint8 [B, W, V, V]. symmetries: one is drawn by
-    rng for each transition; include the identity among them. beta: of the importance weights; 0
-    makes them 1.
+    symmetries: one is drawn by rng for each transition; include the identity among them. beta:
+    of the importance weights; 0 makes them 1.
 
     Raises WireError if an action or a bootstrap offset is outside what the records hold.
     """
     _check(samples, stack)
-    pictures = decode(samples.records)
-    actions = samples.actions
-    if symmetries:
-        if rng is None:
-            raise ValueError("symmetries are drawn at random: give an rng")
-        drawn = rng.integers(len(symmetries), size=len(samples))
-        pictures, actions = _transform(pictures, actions, symmetries, drawn)
-    writable = np.require(pictures, requirements=["C", "W"])  # bytes off the wire are neither
-    on_device = torch.from_numpy(writable).to(device)
+    turns = _drawn(symmetries, rng, len(samples))
+    actions = samples.actions.copy()
+    for symmetry, rows in turns:
+        actions[rows] = symmetry.apply_to_actions(actions[rows])
+    pictures = draw(samples.records, turns)
+    device = pictures.device
     offsets = torch.from_numpy(samples.bootstrap_offsets.astype(np.int64)).to(device)
-    rows = torch.arange(len(samples), device=device)[:, None]
+    each = torch.arange(len(samples), device=device)[:, None]
     window = offsets[:, None] + torch.arange(stack, device=device)
     return Batch(
-        observation=on_device[:, :stack],
+        observation=pictures[:, :stack],
         action=torch.from_numpy(actions.astype(np.int64)).to(device),
         reward=torch.from_numpy(samples.rewards.astype(np.float32)).to(device),
         discount=torch.from_numpy(samples.discounts.astype(np.float32)).to(device),
-        next_observation=on_device[rows, window],
+        next_observation=pictures[each, window],
         importance_weights=torch.from_numpy(importance_weights(samples, beta)).to(device),
         keys=samples.keys,
     )
@@ -111,17 +95,11 @@ def _check(samples: Samples, stack: int) -> None:
         raise WireError(f"a transition needs {last} records and has {width}")
 
 
-def _transform(
-    pictures: UInt8Array,
-    actions: UInt8Array,
-    symmetries: Sequence[Symmetry],
-    drawn: np.ndarray[tuple[int], np.dtype[np.int64]],
-) -> tuple[UInt8Array, UInt8Array]:
-    """Pictures [B, W, V, V] and actions [B], each row under the symmetry drawn for it."""
-    new_pictures, new_actions = np.empty_like(pictures), np.empty_like(actions)
-    for index, symmetry in enumerate(symmetries):
-        rows = np.flatnonzero(drawn == index)
-        if rows.size:
-            new_pictures[rows] = symmetry.apply_to_pictures(pictures[rows])
-            new_actions[rows] = symmetry.apply_to_actions(actions[rows])
-    return new_pictures, new_actions
+def _drawn(symmetries: Sequence[Symmetry], rng: np.random.Generator | None, num: int) -> Turns:
+    """One symmetry for each of num rows; none where there are none."""
+    if not symmetries:
+        return ()
+    if rng is None:
+        raise ValueError("symmetries are drawn at random: give an rng")
+    drawn = rng.integers(len(symmetries), size=num)
+    return [(symmetry, np.flatnonzero(drawn == i)) for i, symmetry in enumerate(symmetries)]

@@ -34,6 +34,7 @@ from common.weights import WeightsWriter
 from common.wire import decode
 from services.actor.__main__ import arena_identity
 from services.learner.batch import collate
+from services.learner.drawing import HostDrawing
 from services.replay.client import ReplayReader
 from tests.system.system_processes import PATIENCE_S, Command, end_all, run_name
 
@@ -88,7 +89,7 @@ class Witness:
 
     def _check(self, samples: Samples) -> None:
         stack = self._config.arena.stack
-        batch = collate(samples, self._decode, stack)
+        batch = collate(samples, HostDrawing(self._decode), stack)
         now = decode_counters(batch.observation.numpy())  # [B, stack]
         later = decode_counters(batch.next_observation.numpy())
         rows = zip(

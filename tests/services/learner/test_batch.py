@@ -10,6 +10,7 @@ from common.config import ReplayConfig
 from common.errors import WireError
 from common.trajectory import Samples, UInt8Array
 from services.learner.batch import collate, importance_exponent_at, importance_weights
+from services.learner.drawing import HostDrawing
 
 VIEW_PX = 5
 
@@ -46,7 +47,7 @@ def make_samples(
 def test_states_are_the_windows_the_offsets_name() -> None:
     """Row b holds pictures 16 b, 16 b + 1, …: the numbers are the positions."""
     samples = make_samples([1, 3, 2], width=7)
-    batch = collate(samples, decode, 4)
+    batch = collate(samples, HostDrawing(decode), 4)
     assert batch.observation[:, :, 1, 1].tolist() == [
         [0, 1, 2, 3],
         [16, 17, 18, 19],
@@ -65,7 +66,7 @@ def test_states_are_the_windows_the_offsets_name() -> None:
 
 
 def test_dtypes_and_shapes() -> None:
-    batch = collate(make_samples([2] * 6, width=6), decode, 4)
+    batch = collate(make_samples([2] * 6, width=6), HostDrawing(decode), 4)
     assert batch.observation.dtype == batch.next_observation.dtype == torch.uint8
     assert batch.observation.shape == batch.next_observation.shape == (6, 4, VIEW_PX, VIEW_PX)
     assert batch.action.dtype == torch.int64
@@ -77,7 +78,7 @@ def test_dtypes_and_shapes() -> None:
 @given(st.integers(1, 4), st.lists(st.integers(1, 5), min_size=1, max_size=8))
 @settings(deadline=None)
 def test_states_for_any_stack_and_offsets(stack: int, offsets: list[int]) -> None:
-    batch = collate(make_samples(offsets, width=stack + 5), decode, stack)
+    batch = collate(make_samples(offsets, width=stack + 5), HostDrawing(decode), stack)
     for row, offset in enumerate(offsets):
         first = row * 16
         assert batch.observation[row, :, 1, 1].tolist() == list(range(first, first + stack))
@@ -97,7 +98,7 @@ def test_records_off_the_wire_are_read_only_and_decoded_once() -> None:
         pictures.flags.writeable = False
         return pictures
 
-    collate(samples, counting, 4)
+    collate(samples, HostDrawing(counting), 4)
     assert shapes == [(2, 5, 1)]
 
 
@@ -134,10 +135,10 @@ def test_a_transition_and_its_action_undergo_the_same_symmetry() -> None:
     samples = make_samples([1, 2, 3] * 10, width=7)
     symmetries = (Identity(), MirrorX(), TurnHalf())
     rng = np.random.default_rng(0)
-    batch = collate(samples, decode, 4, symmetries=symmetries, rng=rng)
+    batch = collate(samples, HostDrawing(decode), 4, symmetries=symmetries, rng=rng)
     corners = {(0, 0): 0, (0, VIEW_PX - 1): 1, (VIEW_PX - 1, VIEW_PX - 1): 2}
     seen = set()
-    plain = collate(samples, decode, 4)
+    plain = collate(samples, HostDrawing(decode), 4)
     for row in range(30):
         both = torch.cat([batch.observation[row], batch.next_observation[row]])
         y, x = np.unravel_index(int(both[0].argmax()), (VIEW_PX, VIEW_PX))
@@ -152,7 +153,7 @@ def test_a_transition_and_its_action_undergo_the_same_symmetry() -> None:
 
 def test_symmetries_need_a_generator() -> None:
     with pytest.raises(ValueError, match="rng"):
-        collate(make_samples([1], width=5), decode, 4, symmetries=(Identity(),))
+        collate(make_samples([1], width=5), HostDrawing(decode), 4, symmetries=(Identity(),))
 
 
 @pytest.mark.parametrize(
@@ -164,7 +165,7 @@ def test_symmetries_need_a_generator() -> None:
 )
 def test_samples_that_cannot_be_are_refused(samples: Samples, message: str) -> None:
     with pytest.raises(WireError, match=message):
-        collate(samples, decode, 4)
+        collate(samples, HostDrawing(decode), 4)
 
 
 def test_importance_weights_by_hand() -> None:
