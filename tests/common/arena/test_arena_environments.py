@@ -5,17 +5,23 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import cv2
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from gymnasium.utils import env_checker
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo import test as pettingzoo_tests
+from pettingzoo.utils import BaseWrapper
 
 from common.arena import Start, make_codec, parallel_env, starts, vector_env
 from common.arena.vector_env import ENV_ID, ArenaVectorEnv
 from common.config import ArenaConfig
+from common.trajectory import UInt8Array
 
 SMALL = ArenaConfig(num_robots=2, view_px=32, max_frames=40)
 TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])
@@ -53,6 +59,67 @@ def test_pettingzoo_accepts_the_pictures(capsys: pytest.CaptureFixture[str]) -> 
 
     pettingzoo_tests.render_test(make)
     assert "▀" in capsys.readouterr().out  # `human` draws in the terminal
+
+
+def test_pettingzoo_saves_the_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its test takes one picture, not a stack: the newest."""
+
+    class Newest(BaseWrapper):  # type: ignore[misc]
+        def observation_space(self, agent: str) -> Box:
+            return Box(0, 255, super().observation_space(agent).shape[1:], np.uint8)
+
+        def observe(self, agent: str) -> UInt8Array:
+            newest: UInt8Array = super().observe(agent)[-1]
+            return newest
+
+    monkeypatch.chdir(tmp_path)
+    env = Newest(parallel_env.env(SMALL))
+    pettingzoo_tests.test_save_obs(env)
+    assert "did not save" not in capsys.readouterr().out
+    saved = {path.stem: path for path in tmp_path.rglob("*.png")}
+    assert set(saved) == {"robot_0", "robot_1"}
+    for agent, path in saved.items():
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(picture, env.observe(agent))
+
+
+def test_pettingzoo_measures_its_performance(capsys: pytest.CaptureFixture[str]) -> None:
+    """Five seconds, over many ends and resets; the figure is nobody's verdict."""
+    pettingzoo_tests.performance_benchmark(parallel_env.env(SMALL))
+    assert "turns per second" in capsys.readouterr().out
+
+
+class OneRobot(gymnasium.Env[UInt8Array, np.int64]):
+    """The vector form's only robot as a single environment, which Gymnasium's checker takes."""
+
+    def __init__(self) -> None:
+        self._envs = ArenaVectorEnv(1, ArenaConfig(num_robots=1, view_px=32))
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[UInt8Array, dict[str, Any]]:
+        super().reset(seed=seed)
+        states, infos = self._envs.reset(seed=seed, options=options)
+        return states[0], infos
+
+    def step(self, action: np.int64) -> tuple[UInt8Array, float, bool, bool, dict[str, Any]]:
+        states, rewards, ends, cuts, infos = self._envs.step(np.array([action]))
+        return states[0], float(rewards[0]), bool(ends[0]), bool(cuts[0]), infos
+
+
+def test_gymnasiums_checker_accepts_a_robot_of_the_vector_form() -> None:
+    env_checker.check_env(OneRobot(), skip_render_check=True)
+
+
+def test_gymnasiums_checker_finds_the_vector_form_seeded() -> None:
+    vector_env.register()
+    made = gymnasium.make_vec(ENV_ID, num_envs=4, config=SMALL)
+    env_checker.check_reset_seed_determinism(made)
+    env_checker.check_reset_options(made)
 
 
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")
