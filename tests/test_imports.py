@@ -26,6 +26,7 @@ PLACES = {
     "scipy": ("common/arena/controllers",),
     "pettingzoo": ("common/arena/parallel_env.py",),
     "gymnasium": ("common/arena/parallel_env.py", "common/arena/vector_env.py"),
+    "stable_baselines3": ("common/arena/sb3.py",),
     "pydantic": ("common/config.py",),
     "torch": (
         "common/network.py",
