@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import emit, seconds_per_call, spread
-from common.arena import layout_symmetries, make_arena, make_codec
+from common.arena import ArenaBatch, layout_symmetries, make_codec
 from common.config import Config, TransportConfig, load_config
 from common.keys import Keys
 from common.policy import make_policy
@@ -52,9 +52,8 @@ def main() -> None:
 
 
 def make_collector(config: Config) -> Collector:
-    arenas = [
-        make_arena(config.arena, np.random.default_rng(i)) for i in range(config.actor.num_arenas)
-    ]
+    rngs = [np.random.default_rng(i) for i in range(config.actor.num_arenas)]
+    arenas = ArenaBatch(config.arena, rngs)
     origin = Origin(
         actor="bench",
         incarnation=1,

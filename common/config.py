@@ -40,6 +40,9 @@ class ArenaConfig(Section):
     kind: Literal["robots", "counting"] = "robots"
     """`robots`: the paper's arena. `counting`: pictures that encode actor, episode and step, for
     tests of the data path. (ours)"""
+    physics: Literal["array", "pymunk"] = "array"
+    """What moves the robots: compiled arrays, or pymunk, which is the reference; both give the same
+    poses. (ours; ancestor: pymunk)"""
     num_robots: Annotated[int, Field(ge=1, le=10)] = 2
     """Robots, and as many targets. (paper: 2, 3, 4)"""
     size_px: Annotated[int, Field(ge=120)] = 600

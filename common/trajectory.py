@@ -5,9 +5,10 @@ frozen; nothing here knows of a clock, a lock or a transport.
 
 Shapes: H = frames stacked in one state - 1, T = transitions of a chunk, n = longest n-step
 return, W = H + 1 + n records that one transition may touch, B = transitions of a batch,
-K = robots of an arena, R = bytes of one observation record.
+K = robots of an arena, A = arenas, R = bytes of one observation record.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 
@@ -58,6 +59,34 @@ class TimeStep:
     @property
     def last(self) -> bool:
         return self.step_type is StepType.LAST
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSteps:
+    """What arenas stepped together return, after a step: the time steps of A arenas."""
+
+    records: UInt8Array  # [A, K, R]
+    rewards: Float32Array  # [A, K]
+    collided: BoolArray  # [A, K]
+    hit_wall: BoolArray  # [A, K]
+    outcomes: tuple[Outcome | None, ...]  # A, set at LAST
+
+    def __iter__(self) -> Iterator[TimeStep]:
+        return (self[arena] for arena in range(len(self.outcomes)))
+
+    def __getitem__(self, arena: int) -> TimeStep:
+        """Of one arena."""
+        outcome = self.outcomes[arena]
+        terminated = outcome is not None and outcome is not Outcome.TIMEOUT
+        return TimeStep(
+            step_type=StepType.MID if outcome is None else StepType.LAST,
+            records=self.records[arena],
+            rewards=self.rewards[arena],
+            discount=0.0 if terminated else 1.0,
+            collided=self.collided[arena],
+            hit_wall=self.hit_wall[arena],
+            outcome=outcome,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,18 +3,21 @@
 Invariants: the only package that imports pymunk or OpenCV; it knows of no network and no service.
 """
 
-from common.arena.arena import Arena, make_arena
+from common.arena.arena import Arena
+from common.arena.batch import ArenaBatch, make_arenas
 from common.arena.codec import FrameCodec, ObservationCodec, SceneCodec, make_codec
 from common.arena.counting import (
     Counters,
     CountingArena,
+    CountingBatch,
     counting_frames,
     counting_outcome,
     counting_reward,
     decode_counters,
 )
 from common.arena.layout import fixed_layout, layout_for, layout_symmetries
-from common.arena.physics import World
+from common.arena.physics import ArrayPhysics, Physics
+from common.arena.pymunk_physics import PymunkPhysics
 from common.arena.rendering import draw_arena, literal_views
 from common.arena.rewards import frame_rewards, target_distances_px
 from common.arena.scene import LEFT, RIGHT, STRAIGHT, Scene, Start
@@ -29,15 +32,19 @@ __all__ = [
     "STRAIGHT",
     "AnalyticViews",
     "Arena",
+    "ArenaBatch",
+    "ArrayPhysics",
     "Counters",
     "CountingArena",
+    "CountingBatch",
     "FrameCodec",
     "ObservationCodec",
+    "Physics",
+    "PymunkPhysics",
     "Scene",
     "SceneCodec",
     "Start",
     "Symmetry",
-    "World",
     "counting_frames",
     "counting_outcome",
     "counting_reward",
@@ -48,7 +55,7 @@ __all__ = [
     "layout_for",
     "layout_symmetries",
     "literal_views",
-    "make_arena",
+    "make_arenas",
     "make_codec",
     "target_distances_px",
     "test_starts",

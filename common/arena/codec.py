@@ -23,7 +23,7 @@ class ObservationCodec(Protocol):
     record_bytes: int
 
     def encode(self, scene: Scene) -> UInt8Array:
-        """Records [K, R] of the robots' views."""
+        """Records [..., K, R] of the robots' views, of one scene or a stack of them."""
         ...
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
@@ -50,9 +50,10 @@ class SceneCodec:
 
     def encode(self, scene: Scene) -> UInt8Array:
         num = len(self._order)
-        numbers = np.empty((num, 5 * num), _NUMBER)
-        numbers[:, : 3 * num] = scene.robots[self._order].reshape(num, 3 * num)
-        numbers[:, 3 * num :] = scene.targets.reshape(2 * num)
+        leading = scene.robots.shape[:-2]
+        numbers = np.empty((*leading, num, 5 * num), _NUMBER)
+        numbers[..., : 3 * num] = scene.robots[..., self._order, :].reshape(*leading, num, 3 * num)
+        numbers[..., 3 * num :] = scene.targets.reshape(*leading, 1, 2 * num)
         return numbers.view(np.uint8)
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
@@ -84,7 +85,8 @@ class FrameCodec:
         return f"FrameCodec(record_bytes={self.record_bytes})"
 
     def encode(self, scene: Scene) -> UInt8Array:
-        return self._scenes.decode(self._scenes.encode(scene)).reshape(-1, self.record_bytes)
+        records = self._scenes.encode(scene)
+        return self._scenes.decode(records).reshape(*records.shape[:-1], self.record_bytes)
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
         pictures = _pictures(records, self.record_bytes, self._config.view_px, out)

@@ -4,6 +4,7 @@ Invariants: everything is a function of (identity, episode, step), actions play 
 repeats its counters from the first pixel to the last, and a magic byte tells it from an empty one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike
 from common.arena.actions import checked_actions
 from common.arena.scene import Scene, Start
 from common.config import ArenaConfig
-from common.trajectory import Int64Array, Outcome, StepType, TimeStep, UInt8Array
+from common.trajectory import Int64Array, Outcome, StepType, TimeStep, TimeSteps, UInt8Array
 
 _MAGIC = 0xC5
 _COUNTERS = np.dtype(
@@ -81,7 +82,7 @@ class CountingArena:
         """Counts on; actions: [K], checked as Arena does."""
         if not self._running:
             raise ValueError("the episode has ended or not begun: reset first")
-        checked_actions(actions, self._num_robots)
+        checked_actions(actions, (self._num_robots,))
         self.frame += 1
         reward = counting_reward(self._episode, self.frame)
         if self.frame < counting_frames(self._identity, self._episode):
@@ -112,6 +113,33 @@ class CountingArena:
         marks = counters.view(np.uint8).reshape(self._num_robots, -1)
         pixels = self._view_px**2
         return np.tile(marks, -(-pixels // _COUNTERS.itemsize))[:, :pixels].copy()
+
+
+class CountingBatch:
+    """The interface of ArenaBatch, over counting arenas."""
+
+    def __init__(self, config: ArenaConfig, identities: Sequence[int]) -> None:
+        """identities: one an arena."""
+        self._arenas = [CountingArena(config, identity=identity) for identity in identities]
+
+    def __len__(self) -> int:
+        return len(self._arenas)
+
+    def reset(self, arena: int, start: Start | None = None) -> TimeStep:
+        """Begins the next episode of an arena."""
+        return self._arenas[arena].reset(start)
+
+    def step(self, actions: ArrayLike) -> TimeSteps:
+        """Counts on in all arenas; actions: [A, K]."""
+        pairs = zip(self._arenas, np.asarray(actions), strict=True)
+        steps = [arena.step(own) for arena, own in pairs]
+        return TimeSteps(
+            records=np.stack([step.records for step in steps]),
+            rewards=np.stack([step.rewards for step in steps]),
+            collided=np.stack([step.collided for step in steps]),
+            hit_wall=np.stack([step.hit_wall for step in steps]),
+            outcomes=tuple(step.outcome for step in steps),
+        )
 
 
 def decode_counters(pictures: UInt8Array) -> Counters:

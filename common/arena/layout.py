@@ -4,6 +4,7 @@ Invariants: every layout that leaves here can be solved: each target is near eno
 robot can reach, and no two are so near that two robots cannot stand on them together.
 """
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -52,6 +53,11 @@ def layout_for(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
     """
     if config.target_layout == "random":
         return _random_layout(config, rng)
+    return _given_layout(config).copy()
+
+
+@cache
+def _given_layout(config: ArenaConfig) -> Float64Array:
     if config.targets_px:
         targets = np.array(config.targets_px, np.float64)
     else:
@@ -84,6 +90,19 @@ def reachable_px(config: ArenaConfig) -> tuple[float, float]:
     """Least and greatest coordinate at which a robot's centre can be."""
     low = config.wall_offset_px + config.wall_thickness_px + config.robot_radius_px
     return low, config.size_px - low
+
+
+def wall_segments(config: ArenaConfig) -> Float64Array:
+    """The walls as lines with a width [4, 5]: x, y of both ends, half the width, px.
+
+    From the inner face outwards they are two steps wide, so that no step leads over one.
+    """
+    half = config.step_px
+    inner = config.wall_offset_px + config.wall_thickness_px
+    low, high = inner - half, config.size_px - inner + half
+    corners = [(low, low), (high, low), (high, high), (low, high)]
+    lines = zip(corners, corners[1:] + corners[:1], strict=True)
+    return np.array([(*start, *end, half) for start, end in lines])
 
 
 def _random_layout(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:

@@ -13,11 +13,12 @@ from gymnasium.spaces import Box, Discrete
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec, wrappers
 
-from common.arena.stacked import StackedArena
+from common.arena.stacked import StackedArenas
 from common.config import ArenaConfig
 from common.trajectory import NUM_ACTIONS, Outcome, TimeStep, UInt8Array
 
 _TERMINAL_PX = 48  # rows of the picture in a terminal; two of them share a line of text
+_ONLY = np.array([0])  # the one arena
 
 Infos = dict[str, dict[str, Any]]
 
@@ -63,7 +64,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         }
         self.action_spaces = {agent: Discrete(NUM_ACTIONS) for agent in self.possible_agents}
         self._config = config
-        self._arena = StackedArena(config, np.random.default_rng())
+        self._arenas = StackedArenas(config, [np.random.default_rng()])
         self._drawn = False
 
     def observation_space(self, agent: str) -> Box:
@@ -81,8 +82,8 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         let be.
         """
         if seed is not None:
-            self._arena = StackedArena(self._config, np.random.default_rng(seed))
-        time_step = self._arena.reset((options or {}).get("start"))
+            self._arenas = StackedArenas(self._config, [np.random.default_rng(seed)])
+        time_step = self._arenas.reset(0, (options or {}).get("start"))
         self.agents = self.possible_agents[:]
         self._draw_for_people()
         return self._observations(), self._infos(time_step)
@@ -99,7 +100,8 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise ValueError(f"no action for {', '.join(missing)}")
-        time_step = self._arena.step(np.array([actions[agent] for agent in self.agents]))
+        chosen = np.array([[actions[agent] for agent in self.agents]])
+        time_step = self._arenas.step(chosen, _ONLY)[0]
         agents = self.agents
         truncated = time_step.outcome is Outcome.TIMEOUT
         terminated = time_step.last and not truncated
@@ -116,13 +118,13 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
 
     def render(self) -> UInt8Array | None:
         """The arena as RGB [600, 600, 3] in the mode rgb_array, else None."""
-        return self._arena.picture() if self.render_mode == "rgb_array" else None
+        return self._arenas.picture(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Nothing is held open."""
 
     def _observations(self) -> dict[str, UInt8Array]:
-        return dict(zip(self.possible_agents, self._arena.states, strict=True))
+        return dict(zip(self.possible_agents, self._arenas.states[0].copy(), strict=True))
 
     def _infos(self, time_step: TimeStep) -> Infos:
         outcome = None if time_step.outcome is None else time_step.outcome.value
@@ -136,7 +138,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         """In the mode human: over the picture before."""
         if self.render_mode == "human":
             back = f"\x1b[{_TERMINAL_PX // 2}A" if self._drawn else ""
-            picture = self._arena.picture(_TERMINAL_PX, smooth=False)
+            picture = self._arenas.picture(0, _TERMINAL_PX, smooth=False)
             sys.stdout.write(back + terminal_picture(picture))
             sys.stdout.flush()
             self._drawn = True

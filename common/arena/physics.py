@@ -1,156 +1,191 @@
-"""Moves robots and finds their collisions with pymunk.
+"""Moves the robots of many arenas and finds their collisions, compiled.
+
+Each robot turns, then proposes its way of step_px. Two proposals that overlap undo each other, one
+beyond a wall is undone (the turn stays); a proposal that overlaps a robot so restored is undone
+too, until none does. All whose way was undone have collided. With back_off_frames, a robot that
+collided is driven straight backwards for that many frames, whatever its action; it may be blocked
+again meanwhile, which neither counts as its collision nor prolongs it.
 
 Invariants: after every move no two robots' centres are nearer than two radii and no centre is
 nearer than a radius to a wall's inner face (touching is allowed); the outcome does not depend on
-the robots' order.
+the robots' order. Numbers are computed as pymunk does, so that both give the same bits
+(common.arena.pymunk_physics).
 """
 
 import math
-from collections.abc import Sequence
-from itertools import combinations
+from typing import Protocol
 
 import numpy as np
-import pymunk
+from numba import njit
 
-from common.arena.layout import reachable_px
+from common.arena.layout import reachable_px, wall_segments
 from common.arena.scene import STRAIGHT
 from common.config import ArenaConfig
-from common.trajectory import BoolArray, Float64Array, UInt8Array
-
-_SLACK_PX = 1e-6  # rounding never lets the quick reject overrule pymunk
-
-Pose = tuple[float, float, float]
+from common.trajectory import BoolArray, Float64Array, Int64Array, UInt8Array
 
 
-class World:
-    """K robots between four walls (paper section 3)."""
-
-    def __init__(self, config: ArenaConfig, robots: Float64Array) -> None:
-        """robots: poses [K, 3]; raises ValueError as place does."""
-        self._config = config
-        self._turn_rad = math.radians(config.turn_deg)
-        radius = config.robot_radius_px
-        inner = config.wall_offset_px + config.wall_thickness_px
-        self._free_low = inner + radius + _SLACK_PX
-        self._free_high = config.size_px - inner - radius - _SLACK_PX
-        self._reach_squared = (2 * radius + config.step_px + _SLACK_PX) ** 2
-        self._space = pymunk.Space()
-        self._add_walls(inner)
-        self._bodies = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in robots]
-        self._shapes = [pymunk.Circle(body, radius) for body in self._bodies]
-        self._space.add(*self._bodies, *self._shapes)
-        self._pairs = tuple(combinations(range(len(robots)), 2))
-        self.place(robots)
-
-    def __repr__(self) -> str:
-        return f"World(robots={self._poses})"
+class Physics(Protocol):
+    """The robots of A arenas, none of which is placed at first."""
 
     @property
     def robots(self) -> Float64Array:
-        """Poses [K, 3], a copy."""
-        return np.array(self._poses, np.float64)
+        """Poses [A, K, 3]; to be read only."""
+        ...
 
-    def place(self, robots: Float64Array) -> None:
-        """Puts the robots at the poses [K, 3] and forgets their collisions.
+    def place(self, arena: int, robots: Float64Array) -> None:
+        """Puts an arena's robots at the poses [K, 3] and forgets their collisions.
 
         Raises ValueError when one overlaps another or a wall.
         """
-        low, high = reachable_px(self._config)
-        self._poses: list[Pose] = [(x, y, heading) for x, y, heading in robots.tolist()]
-        for i, pose in enumerate(self._poses):
-            if not (all(low <= place <= high for place in pose[:2]) and math.isfinite(pose[2])):
-                raise ValueError(f"robot {i} at {pose} is not between the walls")
-            self._put(i, pose)
-        for i, shape in enumerate(self._shapes):
-            if self._space.shape_query(shape):
-                raise ValueError(f"robot {i} at {self._poses[i]} overlaps another")
-        self._back_off = [0] * len(self._poses)
-        self.hit_wall: BoolArray = np.zeros(len(self._poses), np.bool_)
-        """Of those that collided in the last move [K], whose way led beyond a wall."""
+        ...
 
-    def move(self, actions: UInt8Array) -> BoolArray:
-        """Turns and moves every robot at once; returns who collided [K].
+    def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
+        """Turns and moves every robot of the arenas [N] at once; actions: [N, K].
 
-        Each robot turns, then proposes its way of step_px. Two proposals that overlap undo each
-        other, one beyond a wall is undone (the turn stays); a proposal that overlaps a robot so
-        restored is undone too, until none does. All whose way was undone have collided.
-
-        With back_off_frames, a robot that collided is driven straight backwards for that many
-        frames, whatever its action; it may be blocked again meanwhile, which neither counts
-        as its collision nor prolongs it.
+        Returns who collided [N, K] and, of those, whose way led beyond a wall [N, K].
         """
-        turned = [self._turn(i, action) for i, action in enumerate(actions.tolist())]
-        proposals = [self._advance(i, pose) for i, pose in enumerate(turned)]
-        near = self._near(proposals)
-        blocked = self._blocked(proposals, turned, near) if near else set()
-        self._poses = [
-            turned[i] if i in blocked else proposal for i, proposal in enumerate(proposals)
-        ]
-        collided = np.zeros(len(proposals), np.bool_)
-        self.hit_wall = np.zeros(len(proposals), np.bool_)
-        for i, frames in enumerate(self._back_off):
-            if frames:
-                self._back_off[i] = frames - 1
-            elif i in blocked:
-                self._back_off[i] = self._config.back_off_frames
-                collided[i] = True
-                self.hit_wall[i] = self._beyond_wall(proposals[i])
-        return collided
+        ...
 
-    def _beyond_wall(self, pose: Pose) -> bool:
-        low, high = self._free_low - _SLACK_PX, self._free_high + _SLACK_PX
-        return not (low <= pose[0] <= high and low <= pose[1] <= high)
 
-    def _turn(self, i: int, action: int) -> Pose:
-        x, y, heading = self._poses[i]
-        if self._back_off[i] or action == STRAIGHT:
-            return x, y, heading
-        return x, y, math.remainder(heading + (action - STRAIGHT) * self._turn_rad, math.tau)
+class ArrayPhysics:
+    """The rule as one compiled loop over arrays."""
 
-    def _advance(self, i: int, pose: Pose) -> Pose:
-        x, y, heading = pose
-        way = -self._config.step_px if self._back_off[i] else self._config.step_px
-        return x + way * math.cos(heading), y + way * math.sin(heading), heading
+    def __init__(self, config: ArenaConfig, num_arenas: int) -> None:
+        self._config = config
+        self._walls = wall_segments(config)
+        self._robots = np.zeros((num_arenas, config.num_robots, 3))
+        self._back_off = np.zeros((num_arenas, config.num_robots), np.int64)
 
-    def _near(self, proposals: Sequence[Pose]) -> set[int]:
-        """Robots that could be blocked: only for them pymunk is asked."""
-        low, high = self._free_low, self._free_high
-        near = {
-            i for i, (x, y, _) in enumerate(proposals) if not (low < x < high and low < y < high)
-        }
-        for i, j in self._pairs:
-            across = proposals[i][0] - proposals[j][0]
-            along = proposals[i][1] - proposals[j][1]
-            if across * across + along * along < self._reach_squared:
-                near.add(i)
-                near.add(j)
-        return near
+    @property
+    def robots(self) -> Float64Array:
+        return self._robots
 
-    def _blocked(
-        self, proposals: Sequence[Pose], turned: Sequence[Pose], near: set[int]
-    ) -> set[int]:
-        """Robots whose way is undone."""
-        for i, proposal in enumerate(proposals):
-            self._put(i, proposal)
-        blocked: set[int] = set()
-        waiting = near
-        while hits := {i for i in waiting if self._space.shape_query(self._shapes[i])}:
-            for i in hits:
-                self._put(i, turned[i])
-            blocked |= hits
-            waiting = waiting - hits
-        return blocked
+    def place(self, arena: int, robots: Float64Array) -> None:
+        check_placed(self._config, robots)
+        self._robots[arena] = robots
+        self._back_off[arena] = 0
 
-    def _put(self, i: int, pose: Pose) -> None:
-        body = self._bodies[i]
-        body.position = pose[:2]
-        self._space.reindex_shapes_for_body(body)
+    def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
+        collided = np.empty(actions.shape, np.bool_)
+        hit_wall = np.empty(actions.shape, np.bool_)
+        config = self._config
+        _move_all(
+            arenas,
+            actions,
+            self._robots,
+            self._back_off,
+            self._walls,
+            math.radians(config.turn_deg),
+            config.step_px,
+            config.robot_radius_px,
+            config.back_off_frames,
+            collided,
+            hit_wall,
+        )
+        return collided, hit_wall
 
-    def _add_walls(self, inner: float) -> None:
-        """Segments from the inner face outwards, thicker than a step, so none is jumped over."""
-        half = self._config.step_px
-        low, high = inner - half, self._config.size_px - inner + half
-        corners = [(low, low), (high, low), (high, high), (low, high)]
-        for i, corner in enumerate(corners):
-            wall = pymunk.Segment(self._space.static_body, corner, corners[(i + 1) % 4], half)
-            self._space.add(wall)
+
+def check_placed(config: ArenaConfig, robots: Float64Array) -> None:
+    """Raises ValueError when a robot at the poses [K, 3] overlaps another or a wall."""
+    i, inside = _first_misplaced(robots, *reachable_px(config), config.robot_radius_px)
+    if i < len(robots):
+        what = "overlaps another" if inside else "is not between the walls"
+        raise ValueError(f"robot {i} at {tuple(robots[i].tolist())} {what}")
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _first_misplaced(robots, low, high, radius):  # type: ignore[no-untyped-def]
+    """The first robot that cannot be where it is, and whether it is between the walls; else K."""
+    for i in range(len(robots)):
+        x, y, heading = robots[i]
+        if not (low <= x <= high and low <= y <= high and math.isfinite(heading)):
+            return i, False
+        if _meets_robot(i, robots, radius):
+            return i, True
+    return len(robots), True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _move_all(  # type: ignore[no-untyped-def]
+    arenas,
+    actions,
+    robots,
+    back_off,
+    walls,
+    turn_rad,
+    step_px,
+    radius,
+    back_off_frames,
+    collided,
+    hit_wall,
+):
+    num_robots = robots.shape[1]
+    places = np.empty((num_robots, 2), np.float64)
+    hits = np.empty(num_robots, np.bool_)
+    for n in range(len(arenas)):
+        poses, backs = robots[arenas[n]], back_off[arenas[n]]
+        blocked, beyond = collided[n], hit_wall[n]
+        for i in range(num_robots):
+            if backs[i] == 0 and actions[n, i] != STRAIGHT:
+                turn = (np.int64(actions[n, i]) - STRAIGHT) * turn_rad
+                poses[i, 2] = _wrapped(poses[i, 2] + turn)
+            way = -step_px if backs[i] > 0 else step_px
+            places[i, 0] = poses[i, 0] + way * math.cos(poses[i, 2])
+            places[i, 1] = poses[i, 1] + way * math.sin(poses[i, 2])
+            beyond[i] = _meets_wall(places[i, 0], places[i, 1], radius, walls)
+        _block(poses, places, radius, beyond, blocked, hits)
+        for i in range(num_robots):
+            poses[i, 0], poses[i, 1] = places[i, 0], places[i, 1]
+            if backs[i] > 0:
+                backs[i] -= 1
+                blocked[i] = beyond[i] = False
+            elif blocked[i]:
+                backs[i] = back_off_frames
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _block(poses, places, radius, beyond, blocked, hits):  # type: ignore[no-untyped-def]
+    """Puts places [K, 2] that cannot be taken back to the poses', and marks them blocked."""
+    blocked[:] = False
+    again = True
+    while again:
+        again = False
+        for i in range(len(places)):
+            hits[i] = not blocked[i] and (beyond[i] or _meets_robot(i, places, radius))
+        for i in range(len(places)):
+            if hits[i]:
+                places[i, 0], places[i, 1] = poses[i, 0], poses[i, 1]
+                blocked[i] = again = True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _meets_robot(i, places, radius):  # type: ignore[no-untyped-def]
+    reach = radius + radius
+    for j in range(len(places)):
+        across = places[i, 0] - places[j, 0]
+        along = places[i, 1] - places[j, 1]
+        if j != i and across * across + along * along < reach * reach:
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _meets_wall(x, y, radius, walls):  # type: ignore[no-untyped-def]
+    """Whether the disc is nearer to a segment's line than the radius and the line's half width."""
+    for ax, ay, bx, by, half in walls:
+        dx, dy = bx - ax, by - ay
+        t = (dx * (x - ax) + dy * (y - ay)) / (dx * dx + dy * dy)
+        t = max(0.0, min(t, 1.0))
+        across, along = ax + dx * t - x, ay + dy * t - y
+        if across * across + along * along < (radius + half) * (radius + half):
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _wrapped(angle):  # type: ignore[no-untyped-def]
+    """math.remainder(angle, math.tau), which numba lacks; both are exact."""
+    rest = np.fmod(angle, math.tau)
+    if rest > math.pi:
+        return rest - math.tau
+    return rest + math.tau if rest < -math.pi else rest

@@ -1,4 +1,4 @@
-"""What a frame is worth to each robot (paper section 3).
+"""What a frame is worth to each robot (paper section 3), in many arenas at once.
 
 Invariants: pure functions of the scene after the frame; success is all robots' or none's.
 """
@@ -6,30 +6,38 @@ Invariants: pure functions of the scene after the frame; success is all robots' 
 import math
 
 import numpy as np
+from numba import njit
 
 from common.arena.scene import Scene
 from common.config import ArenaConfig
-from common.trajectory import BoolArray, Float32Array, Float64Array
+from common.trajectory import BoolArray, Float32Array, Float64Array, Int64Array
 
 
 def frame_rewards(
-    scene: Scene, collided: BoolArray, frame: int, config: ArenaConfig
-) -> tuple[Float32Array, bool]:
-    """Rewards [K] of a frame, and whether it is success.
+    scene: Scene, collided: BoolArray, frames: Int64Array, config: ArenaConfig
+) -> tuple[Float32Array, BoolArray]:
+    """Rewards [N, K] of a frame of N arenas, and in which of them it is success [N].
 
-    scene: after the frame's moves. collided: [K]. frame: f of the paper, 1 after the first move.
-    A robot that collided gets collision_reward, wherever it stands.
+    scene: of all the arenas [N, ...], after the frame's moves. collided: [N, K]. frames: f of the
+    paper [N], 1 after the first move. A robot that collided gets collision_reward, wherever it
+    stands.
     """
-    distances = target_distances_px(scene)
-    if not collided.any() and _each_has_its_own(distances < config.success_radius_px):
-        return np.full(len(collided), config.success_reward, np.float32), True
-    nearest = distances.min(axis=1)
-    reach = on_target_px(config)
-    proximity = config.proximity_weight
-    frames_left = 1 - min(frame, config.f_max) / config.f_max
-    on_target = (1 - nearest / reach) * proximity + frames_left * (1 - proximity)
-    rewards = np.where(nearest < reach, on_target, config.step_reward)
-    return np.where(collided, config.collision_reward, rewards).astype(np.float32), False
+    rewards = np.empty(collided.shape, np.float32)
+    success = np.empty(len(collided), np.bool_)
+    _judge_all(
+        scene.robots,
+        scene.targets,
+        collided,
+        frames,
+        config.success_radius_px,
+        on_target_px(config),
+        config.proximity_weight,
+        config.f_max,
+        (config.success_reward, config.collision_reward, config.step_reward),
+        rewards,
+        success,
+    )
+    return rewards, success
 
 
 def target_distances_px(scene: Scene) -> Float64Array:
@@ -44,20 +52,56 @@ def on_target_px(config: ArenaConfig) -> float:
     return math.sqrt(2 * config.target_size_px**2 + config.robot_radius_px)
 
 
-def _each_has_its_own(within: BoolArray) -> bool:
-    """Whether every robot [K] has a target [M] within reach that no other needs."""
-    if not within.any(axis=1).all() or within.any(axis=0).sum() < len(within):
-        return False
-    owners: dict[int, int] = {}
+@njit(nogil=True, cache=True, error_model="numpy")
+def _judge_all(  # type: ignore[no-untyped-def]
+    robots, targets, collided, frames, delta, reach, proximity, f_max, paid, rewards, success
+):
+    success_reward, collision_reward, step_reward = paid
+    num_robots, num_targets = robots.shape[1], targets.shape[1]
+    distances = np.empty((num_robots, num_targets), np.float64)
+    for n in range(len(robots)):
+        for i in range(num_robots):
+            for j in range(num_targets):
+                across = robots[n, i, 0] - targets[n, j, 0]
+                along = robots[n, i, 1] - targets[n, j, 1]
+                distances[i, j] = math.sqrt(across * across + along * along)
+        success[n] = not collided[n].any() and _each_has_its_own(distances, delta)
+        frames_left = 1 - min(frames[n], f_max) / f_max
+        for i in range(num_robots):
+            nearest = distances[i].min()
+            if success[n]:
+                rewards[n, i] = success_reward
+            elif collided[n, i]:
+                rewards[n, i] = collision_reward
+            elif nearest < reach:
+                rewards[n, i] = (1 - nearest / reach) * proximity + frames_left * (1 - proximity)
+            else:
+                rewards[n, i] = step_reward
 
-    def seat(robot: int, tried: set[int]) -> bool:
-        """Gives the robot a target, moving owners on where that helps (an augmenting path)."""
-        for target in np.flatnonzero(within[robot]).tolist():
-            if target not in tried:
-                tried.add(target)
-                if target not in owners or seat(owners[target], tried):
-                    owners[target] = robot
-                    return True
-        return False
 
-    return all(seat(robot, set()) for robot in range(len(within)))
+@njit(nogil=True, cache=True, error_model="numpy")
+def _each_has_its_own(distances, delta):  # type: ignore[no-untyped-def]
+    """Whether every robot [K] has a target [M] nearer than delta that no other needs."""
+    num_robots, num_targets = distances.shape
+    for robot in range(num_robots):
+        if distances[robot].min() >= delta:
+            return False
+    owners = np.full(num_targets, -1, np.int64)
+    tried = np.empty(num_targets, np.bool_)
+    for robot in range(num_robots):
+        tried[:] = False
+        if not _seat(robot, distances, delta, owners, tried):
+            return False
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _seat(robot, distances, delta, owners, tried):  # type: ignore[no-untyped-def]
+    """Gives the robot a target, moving owners on where that helps (an augmenting path)."""
+    for target in range(len(owners)):
+        if distances[robot, target] < delta and not tried[target]:
+            tried[target] = True
+            if owners[target] < 0 or _seat(owners[target], distances, delta, owners, tried):
+                owners[target] = robot
+                return True
+    return False

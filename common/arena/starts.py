@@ -65,11 +65,15 @@ def _place(config: ArenaConfig, rng: np.random.Generator, num_turns: int) -> Flo
 def _random_poses(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
     """Candidates [C, 3]."""
     low, high = reachable_px(config)
-    return rng.uniform((low, low, -np.pi), (high, high, np.pi), (_CANDIDATES, 3))
+    least = np.array([low, low, -np.pi])
+    span = np.array([high, high, np.pi]) - least
+    return np.asarray(least + span * rng.random((_CANDIDATES, 3)), np.float64)
 
 
 def _circle_paths(config: ArenaConfig, poses: Float64Array, num_turns: int) -> Float64Array:
     """Places [C, num_turns + 1, 2] of poses [C, 3] that turn left every frame."""
+    if not num_turns:
+        return poses[:, None, :2]
     turns = np.arange(1, num_turns + 1) * math.radians(config.turn_deg)
     headings = poses[:, 2:] - turns
     steps = config.step_px * np.stack([np.cos(headings), np.sin(headings)], axis=2)

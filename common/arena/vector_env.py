@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from common.arena.stacked import StackedArena
+from common.arena.stacked import StackedArenas
 from common.config import ArenaConfig
 from common.trajectory import (
     NUM_ACTIONS,
@@ -41,6 +41,7 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         "render_fps": 30,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
+    _ended: BoolArray  # [A], arenas whose episode the last step ended
 
     def __init__(
         self,
@@ -70,6 +71,7 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._config = config
+        self._num_arenas = num_envs // config.num_robots
         self._seed(None)
 
     def reset(
@@ -79,8 +81,8 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         super().reset(seed=seed)
         if seed is not None:
             self._seed(seed)
-        steps = [arena.reset() for arena in self._arenas]
-        self._ended = [False] * len(steps)
+        steps = [self._arenas.reset(arena) for arena in range(self._num_arenas)]
+        self._ended[:] = False
         return self._states(), self._infos(steps)
 
     def step(
@@ -93,18 +95,20 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         chosen = np.asarray(actions)
         if chosen.shape != (self.num_envs,):
             raise ValueError(f"actions are {chosen.shape}, not [{self.num_envs}]")
-        by_arena = chosen.reshape(len(self._arenas), -1)
+        running = np.flatnonzero(~self._ended)
+        by_arena = chosen.reshape(self._num_arenas, -1)
+        played = iter(self._arenas.step(by_arena[running], running))
         steps = [
-            arena.reset() if ended else arena.step(own)
-            for arena, ended, own in zip(self._arenas, self._ended, by_arena, strict=True)
+            self._arenas.reset(arena) if ended else next(played)
+            for arena, ended in enumerate(self._ended.tolist())
         ]
-        self._ended = [time_step.last for time_step in steps]
-        truncated = [time_step.outcome is Outcome.TIMEOUT for time_step in steps]
+        self._ended = np.array([step.last for step in steps])
+        truncated = np.array([step.outcome is Outcome.TIMEOUT for step in steps])
         return (
             self._states(),
-            np.concatenate([time_step.rewards for time_step in steps]).astype(np.float64),
-            self._each(np.array(self._ended) & ~np.array(truncated)),
-            self._each(np.array(truncated)),
+            np.concatenate([step.rewards for step in steps]).astype(np.float64),
+            self._each(self._ended & ~truncated),
+            self._each(truncated),
             self._infos(steps),
         )
 
@@ -112,20 +116,18 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         """Each robot's arena as RGB [600, 600, 3]; None without a mode."""
         if self.render_mode is None:
             return None
-        pictures = [arena.picture() for arena in self._arenas]
+        pictures = [self._arenas.picture(arena) for arena in range(self._num_arenas)]
         return tuple(picture for picture in pictures for _ in range(self._config.num_robots))
 
     def _seed(self, seed: int | None) -> None:
         """New arenas, each with a generator of its own."""
-        num_arenas = self.num_envs // self._config.num_robots
-        self._arenas = [
-            StackedArena(self._config, np.random.default_rng(child))
-            for child in np.random.SeedSequence(seed).spawn(num_arenas)
-        ]
-        self._ended = [True] * num_arenas
+        seeds = np.random.SeedSequence(seed).spawn(self._num_arenas)
+        self._arenas = StackedArenas(self._config, [np.random.default_rng(s) for s in seeds])
+        self._ended = np.ones(self._num_arenas, np.bool_)
 
     def _states(self) -> UInt8Array:
-        return np.concatenate([arena.states for arena in self._arenas])
+        states = self._arenas.states
+        return states.reshape(self.num_envs, *states.shape[2:]).copy()
 
     def _infos(self, steps: list[TimeStep]) -> dict[str, Any]:
         known = np.ones(self.num_envs, np.bool_)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from common.arena import make_arena, make_codec
+from common.arena import make_arenas, make_codec
 from common.config import Config
 from common.errors import CheckpointError
 from common.exploration import epsilons
@@ -158,12 +158,11 @@ def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
     name_entropy = int.from_bytes(worker.encode(), "little")
     seeds = np.random.SeedSequence([config.run.seed, name_entropy])
     *arena_seeds, policy_seed = seeds.spawn(config.actor.num_arenas + 1)
-    arenas = [
-        make_arena(
-            config.arena, np.random.default_rng(seed), identity=arena_identity(worker, index)
-        )
-        for index, seed in enumerate(arena_seeds)
-    ]
+    arenas = make_arenas(
+        config.arena,
+        [np.random.default_rng(seed) for seed in arena_seeds],
+        [arena_identity(worker, index) for index in range(config.actor.num_arenas)],
+    )
     origin = Origin(
         actor=worker,
         incarnation=time.time_ns(),

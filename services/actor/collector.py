@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common.arena import Arena, CountingArena, ObservationCodec
+from common.arena import ArenaBatch, CountingBatch, ObservationCodec
 from common.config import Config
 from common.policy import FrameStack, Policy
 from common.trajectory import Chunk, EpisodeSummary, Float32Array, TimeStep, UInt8Array
@@ -45,7 +45,7 @@ class Collector:
         self,
         config: Config,
         origin: Origin,
-        arenas: Sequence[Arena | CountingArena],
+        arenas: ArenaBatch | CountingBatch,
         codec: ObservationCodec,
         policy: Policy,
         rng: np.random.Generator,
@@ -57,10 +57,12 @@ class Collector:
         self._rng = rng
         self._num_robots = config.arena.num_robots
         num_states = len(arenas) * self._num_robots
-        self._chunkers = [[Chunker(origin) for _ in range(self._num_robots)] for _ in arenas]
+        self._chunkers = [
+            [Chunker(origin) for _ in range(self._num_robots)] for _ in range(len(arenas))
+        ]
         self._frames = FrameStack(num_states, config.arena.stack, config.arena.view_px)
         self._sequence: Iterator[int] = iter(range(2**62))
-        self._episodes = [_Episode() for _ in arenas]
+        self._episodes = [_Episode() for _ in range(len(arenas))]
         self.seconds = Seconds()
         self.env_steps = 0
         self.num_episodes = 0
@@ -79,7 +81,7 @@ class Collector:
         inferred = time.perf_counter()
         shape = (len(self._arenas), self._num_robots)
         actions = selection.actions.reshape(shape)
-        time_steps = [arena.step(a) for arena, a in zip(self._arenas, actions, strict=True)]
+        time_steps = self._arenas.step(actions)
         stepped = time.perf_counter()
         taken_q = selection.taken_q.reshape(shape)
         greedy_q = selection.greedy_q.reshape(shape)
@@ -100,7 +102,8 @@ class Collector:
         ended = [index for index, time_step in enumerate(time_steps) if time_step.last]
         summaries = [self._summary(i, time_steps[i], float(epsilons[i])) for i in ended]
         chunked = time.perf_counter()
-        self._draw([time_step.records for time_step in time_steps])
+        records = time_steps.records.reshape(len(per_robot), -1)
+        self._frames.push(self._codec.decode(records))
         self._reset(ended)
         self.env_steps += len(self._arenas)
         self.seconds.inference += inferred - started
@@ -130,13 +133,10 @@ class Collector:
                 sequence=self._sequence,
             )
 
-    def _draw(self, records: list[UInt8Array]) -> None:
-        self._frames.push(self._codec.decode(np.concatenate(records)))
-
     def _reset(self, indices: Sequence[int]) -> None:
         """Start new episodes in these arenas."""
         for index in indices:
-            time_step = self._arenas[index].reset()
+            time_step = self._arenas.reset(index)
             for chunker, record in zip(self._chunkers[index], time_step.records, strict=True):
                 chunker.start(record)
             first = index * self._num_robots

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.arena import Arena, ObservationCodec, Scene, Start
+from common.arena import ArenaBatch, ObservationCodec, Scene, Start
 from common.arena.controllers import Controller
 from common.config import ArenaConfig
 from common.policy import FrameStack, Policy
@@ -135,7 +135,7 @@ def play(
 ) -> list[EpisodeResult] | None:
     """Results in the order of the starts; None where `go_on`, told how many are done, says no."""
     rng = np.random.default_rng(0)  # unused: every start is given
-    arenas = [Arena(config, rng, max_collisions=1) for _ in range(min(len(starts), _MAX_ARENAS))]
+    arenas = ArenaBatch(config, [rng] * min(len(starts), _MAX_ARENAS), max_collisions=1)
     results: dict[int, EpisodeResult] = {}
     waiting = iter(enumerate(starts))
     running: dict[int, _Running] = {}
@@ -146,7 +146,7 @@ def play(
             running.pop(index, None)
             return
         number, start = following
-        player.begin(index, arenas[index].reset(start))
+        player.begin(index, arenas.reset(index, start))
         running[index] = _Running(number)
 
     for index in range(len(arenas)):
@@ -155,38 +155,38 @@ def play(
         if not go_on(len(results)):
             return None
         active = np.array(sorted(running))
-        scenes = [arenas[i].scene for i in active]
+        scenes = [arenas.scene(i) for i in active]
         actions = player.act(active, scenes)
-        steps = [arenas[i].step(a) for i, a in zip(active, actions, strict=True)]
-        player.observe(active, np.stack([s.records for s in steps]))
-        for index, scene, time_step in zip(active.tolist(), scenes, steps, strict=True):
+        steps = arenas.step(actions, active)
+        player.observe(active, steps.records)
+        for i, (index, scene) in enumerate(zip(active.tolist(), scenes, strict=True)):
             episode = running[index]
-            episode.score += float(time_step.rewards.mean())
+            episode.score += float(steps.rewards[i].mean())
             episode.path.append(scene.robots)
-            if time_step.outcome is not None:
+            if steps.outcomes[i] is not None:
                 results[episode.number] = _result(
-                    config, episode, arenas[index], time_step, keep_paths
+                    config, episode, arenas.scene(index), steps[i], keep_paths
                 )
                 begin(index)
     return [results[number] for number in range(len(starts))]
 
 
 def _result(
-    config: ArenaConfig, episode: _Running, arena: Arena, last: TimeStep, keep_path: bool
+    config: ArenaConfig, episode: _Running, scene: Scene, last: TimeStep, keep_path: bool
 ) -> EpisodeResult:
-    """Of an episode whose arena stands at its last time step."""
+    """Of an episode that ended with this scene and time step."""
     if last.outcome is None:
         raise ValueError("the episode has not ended")
-    path = np.stack([*episode.path, arena.scene.robots])
+    path = np.stack([*episode.path, scene.robots])
     return EpisodeResult(
         outcome=last.outcome,
-        frames=arena.frame,
+        frames=len(episode.path),
         score=episode.score,
-        targets=arena.scene.targets,
+        targets=scene.targets,
         robots=path if keep_path else path[:0],
         journey=journey(
             path,
-            arena.scene.targets,
+            scene.targets,
             last.collided & ~last.hit_wall,
             last.hit_wall,
             config.robot_radius_px,

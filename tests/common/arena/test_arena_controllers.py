@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.arena import Arena, Scene, World, starts
+from common.arena import Arena, ArrayPhysics, Scene, starts
 from common.arena.controllers import CONTROLLERS, SafeCircle, controller, greedy_actions
 from common.arena.controllers.heading import actions_towards, shortest_assignment
 from common.arena.layout import reachable_px
@@ -143,10 +143,11 @@ def least_gap(config: ArenaConfig, poses: Float64Array, sides: Float64Array) -> 
 
 def test_circling_stays_on_its_circle() -> None:
     config = ArenaConfig(num_robots=1)
-    world = World(config, np.array([[300.0, 300.0, 0.3]]))
+    physics = ArrayPhysics(config, 1)
+    physics.place(0, np.array([[300.0, 300.0, 0.3]]))
     places = []
     for _ in range(360):
-        world.move(np.zeros(1, np.uint8))
-        places.append(world.robots[0, :2])
+        physics.move(np.array([0]), np.zeros((1, 1), np.uint8))
+        places.append(physics.robots[0, 0, :2].copy())
     across = np.ptp(np.array(places), axis=0)
     assert across == pytest.approx(2 * 6.27, abs=0.05)

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 
 from common.arena import (
     Arena,
+    ArenaBatch,
     CountingArena,
+    CountingBatch,
     Start,
     Symmetry,
-    make_arena,
+    make_arenas,
     make_codec,
     starts,
 )
@@ -131,24 +133,58 @@ def test_misuse_is_refused() -> None:
         arena(num_robots=10, size_px=200, success_radius_px=24)
 
 
-def test_make_arena_goes_by_kind() -> None:
-    rng = np.random.default_rng(0)
-    assert isinstance(make_arena(ArenaConfig(), rng, max_collisions=1), Arena)
+def test_make_arenas_goes_by_kind() -> None:
+    rngs = [np.random.default_rng(0)]
+    assert isinstance(make_arenas(ArenaConfig(), rngs, [3]), ArenaBatch)
     config = ArenaConfig(kind="counting", codec="frames")
-    assert isinstance(make_arena(config, rng, identity=3), CountingArena)
+    assert isinstance(make_arenas(config, rngs, [3]), CountingBatch)
 
 
-def fingerprint() -> str:
-    """A hash of what a seed determines; the same in another process."""
-    config = ArenaConfig(num_robots=4, target_layout="random")
+@pytest.mark.parametrize("physics", ["array", "pymunk"])
+def test_a_batch_plays_what_its_arenas_would_play_alone(physics: str) -> None:
+    config = ArenaConfig.model_validate(
+        {"num_robots": 3, "size_px": 300, "max_frames": 40, "physics": physics}
+    )
+    batch = ArenaBatch(config, [np.random.default_rng(seed) for seed in range(4)])
+    alone = [Arena(config, np.random.default_rng(seed)) for seed in range(4)]
+    for index, game in enumerate(alone):
+        np.testing.assert_array_equal(batch.reset(index).records, game.reset().records)
+    rng = np.random.default_rng(9)
+    for _ in range(200):
+        arenas = np.flatnonzero(rng.random(4) < 0.7)
+        moves = rng.integers(0, 3, (len(arenas), 3))
+        steps = batch.step(moves, arenas)
+        for index, own, ours in zip(arenas, moves, steps, strict=True):
+            theirs = alone[index].step(own)
+            assert (ours.step_type, ours.outcome) == (theirs.step_type, theirs.outcome)
+            assert ours.discount == theirs.discount
+            for name in ("records", "rewards", "collided", "hit_wall"):
+                np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+            assert (batch.frames[index], batch.collisions[index]) == (
+                alone[index].frame,
+                alone[index].collisions,
+            )
+            if ours.last:
+                with pytest.raises(ValueError, match="reset first"):
+                    batch.step(moves[:1], np.array([index]))
+                np.testing.assert_array_equal(
+                    batch.reset(index).records, alone[index].reset().records
+                )
+
+
+def fingerprint(physics: str) -> str:
+    """A hash of 1 000 seeded steps; the same in another process and with the other physics."""
+    base = {"num_robots": 4, "target_layout": "random", "max_collisions": 20}
+    config = ArenaConfig.model_validate({**base, "physics": physics})
     rng = np.random.default_rng(7)
     game = Arena(config, rng)
     codec = make_codec(config)
     play = controller("random", config, rng)
     total = hashlib.sha256()
     step = game.reset()
-    for _ in range(300):
-        total.update(step.records.tobytes() + step.rewards.tobytes() + step.collided.tobytes())
+    for _ in range(1000):
+        for array in (step.records, step.rewards, step.collided, step.hit_wall, game.scene.robots):
+            total.update(array.tobytes())
         total.update(codec.decode(step.records).tobytes())
         step = game.reset() if step.last else game.step(play(game.scene))
     for begin in starts.test_starts(config, 20, seed=1):
@@ -156,16 +192,16 @@ def fingerprint() -> str:
     return total.hexdigest()
 
 
-def test_a_seed_gives_the_same_play_in_another_process() -> None:
+def test_a_seed_gives_the_same_play_in_another_process_and_by_pymunk() -> None:
     code = (
         "import importlib.util as u; "
         f"s = u.spec_from_file_location('episodes', {__file__!r}); "
-        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.fingerprint())"
+        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.fingerprint('array'))"
     )
     other = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
-    assert other.stdout.strip() == fingerprint()
+    assert other.stdout.strip() == fingerprint("array") == fingerprint("pymunk")
 
 
 @settings(max_examples=16)

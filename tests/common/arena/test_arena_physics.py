@@ -7,28 +7,64 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.arena import LEFT, RIGHT, STRAIGHT, Scene, World, layout_symmetries, training_start
+from common.arena import (
+    LEFT,
+    RIGHT,
+    STRAIGHT,
+    ArrayPhysics,
+    Physics,
+    PymunkPhysics,
+    Scene,
+    layout_symmetries,
+    training_start,
+)
 from common.arena.layout import reachable_px
 from common.config import ArenaConfig
-from common.trajectory import BoolArray, Float64Array
+from common.trajectory import BoolArray, Float64Array, UInt8Array
 
 TURN = math.radians(23)
 EAST, SOUTH, WEST, NORTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 GO = STRAIGHT
 
 
-def world(*robots: tuple[float, float, float], **settings: float) -> World:
+PHYSICS = {"array": ArrayPhysics, "pymunk": PymunkPhysics}
+
+
+class World:
+    """One arena's robots, moved by the physics that the configuration names."""
+
+    def __init__(self, config: ArenaConfig, robots: Float64Array) -> None:
+        self._physics: Physics = PHYSICS[config.physics](config, 1)
+        self._physics.place(0, robots)
+        self.hit_wall = np.zeros(len(robots), np.bool_)
+
+    @property
+    def robots(self) -> Float64Array:
+        return self._physics.robots[0].copy()
+
+    def move(self, moves: UInt8Array) -> BoolArray:
+        collided, hit_wall = self._physics.move(np.array([0]), moves[None])
+        self.hit_wall = hit_wall[0]
+        return collided[0]
+
+
+def world(*robots: tuple[float, float, float], **settings: object) -> World:
     config = ArenaConfig.model_validate({"num_robots": len(robots), **settings})
-    return World(config, np.array(robots))
+    return World(config, np.array(robots, np.float64))
 
 
-def actions(*values: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
+@pytest.fixture(params=PHYSICS)
+def physics(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def actions(*values: int) -> UInt8Array:
     return np.array(values, np.uint8)
 
 
 @pytest.mark.parametrize(("action", "heading"), [(LEFT, -TURN), (STRAIGHT, 0.0), (RIGHT, TURN)])
-def test_a_robot_turns_and_then_moves(action: int, heading: float) -> None:
-    arena = world((300, 300, EAST))
+def test_a_robot_turns_and_then_moves(physics: str, action: int, heading: float) -> None:
+    arena = world((300, 300, EAST), physics=physics)
     assert not arena.move(actions(action)).any()
     expected = (300 + 2.5 * math.cos(heading), 300 + 2.5 * math.sin(heading), heading)
     np.testing.assert_allclose(arena.robots[0], expected)
@@ -58,21 +94,23 @@ def test_a_robot_turns_and_then_moves(action: int, heading: float) -> None:
         ([(37, 300, WEST), (89.4, 300, WEST), (139.5, 300, WEST)], [True, True, True]),
     ],
 )
-def test_collisions(robots: list[tuple[float, float, float]], collided: list[bool]) -> None:
-    arena = world(*robots)
+def test_collisions(
+    physics: str, robots: list[tuple[float, float, float]], collided: list[bool]
+) -> None:
+    arena = world(*robots, physics=physics)
     assert arena.move(actions(*[GO] * len(robots))).tolist() == collided
     for robot, before, blocked in zip(arena.robots, robots, collided, strict=True):
         assert (robot[:2].tolist() == list(before[:2])) is blocked
 
 
-def test_a_blocked_robot_keeps_its_turn() -> None:
-    arena = world((37, 300, WEST))
+def test_a_blocked_robot_keeps_its_turn(physics: str) -> None:
+    arena = world((37, 300, WEST), physics=physics)
     assert arena.move(actions(RIGHT)).all()
     np.testing.assert_allclose(arena.robots[0], (37, 300, TURN - math.pi))
 
 
-def test_back_off_drives_backwards_and_is_neither_steered_nor_punished() -> None:
-    arena = world((38, 300, WEST), back_off_frames=2)
+def test_back_off_drives_backwards_and_is_neither_steered_nor_punished(physics: str) -> None:
+    arena = world((38, 300, WEST), back_off_frames=2, physics=physics)
     assert arena.move(actions(STRAIGHT)).all()
     assert not arena.move(actions(LEFT)).any()
     assert not arena.move(actions(LEFT)).any()
@@ -81,8 +119,9 @@ def test_back_off_drives_backwards_and_is_neither_steered_nor_punished() -> None
     np.testing.assert_allclose(arena.robots[0, 0], 40.5)
 
 
-def test_a_robot_blocked_while_backing_off_does_not_collide() -> None:
-    arena = world((562, 300, EAST), (512, 300, EAST), (462, 300, NORTH), back_off_frames=3)
+def test_a_robot_blocked_while_backing_off_does_not_collide(physics: str) -> None:
+    robots = (562, 300, EAST), (512, 300, EAST), (462, 300, NORTH)
+    arena = world(*robots, back_off_frames=3, physics=physics)
     assert arena.move(actions(GO, GO, GO)).tolist() == [True, True, False]
     before = arena.robots
     # the second drives back into the third, the first into the second
@@ -101,9 +140,11 @@ def test_a_robot_blocked_while_backing_off_does_not_collide() -> None:
         [(300, 300, 0), (349, 300, 0)],
     ],
 )
-def test_impossible_places_are_refused(robots: list[tuple[float, float, float]]) -> None:
+def test_impossible_places_are_refused(
+    physics: str, robots: list[tuple[float, float, float]]
+) -> None:
     with pytest.raises(ValueError, match="robot"):
-        world(*robots)
+        world(*robots, physics=physics)
 
 
 def crowd(seed: int, **settings: object) -> tuple[ArenaConfig, Float64Array, np.random.Generator]:
@@ -193,8 +234,8 @@ def by_the_rule(
         blocked |= hit & ~blocked
 
 
-def test_pymunk_finds_what_the_rule_says() -> None:
-    config, robots, rng = crowd(1)
+def test_collisions_are_what_the_rule_says(physics: str) -> None:
+    config, robots, rng = crowd(1, physics=physics)
     arena = World(config, robots)
     low, high = reachable_px(config)
     seen = 0
@@ -210,3 +251,41 @@ def test_pymunk_finds_what_the_rule_says() -> None:
         np.testing.assert_allclose(arena.robots[:, :2], expected[:, :2], atol=1e-9)
         seen += int(blocked.sum())
     assert seen > 100
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_robots=st.integers(1, 10),
+    back_off=st.sampled_from([0, 1, 10]),
+    step=st.sampled_from([2.5, 7.3, 60.0]),
+    turn=st.sampled_from([23.0, 90.0, 171.3]),
+    offset=st.sampled_from([10.0, 0.0, 3.7]),
+)
+def test_the_array_is_pymunk_to_the_bit(
+    seed: int, num_robots: int, back_off: int, step: float, turn: float, offset: float
+) -> None:
+    config = ArenaConfig(
+        num_robots=num_robots,
+        size_px=round(60 + 100 * num_robots**0.5),
+        back_off_frames=back_off,
+        step_px=step,
+        turn_deg=turn,
+        wall_offset_px=offset,
+    )
+    rng = np.random.default_rng(seed)
+    one, other = ArrayPhysics(config, 2), PymunkPhysics(config, 2)
+    for arena in (0, 1):
+        robots = training_start(config, np.zeros((num_robots, 2)), rng).robots
+        robots[:, 2] *= rng.choice([1, 5])  # headings are given as anyone likes
+        one.place(arena, robots)
+        other.place(arena, robots)
+    for _ in range(60):
+        arenas = np.flatnonzero(rng.random(2) < 0.9)
+        if len(arenas):
+            moves = rng.integers(0, 3, (len(arenas), num_robots), dtype=np.uint8)
+            for ours, theirs in zip(
+                one.move(arenas, moves), other.move(arenas, moves), strict=True
+            ):
+                np.testing.assert_array_equal(ours, theirs)
+        assert one.robots.tobytes() == other.robots.tobytes()

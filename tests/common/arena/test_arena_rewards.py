@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from common.arena import Scene, frame_rewards
 from common.arena.rewards import on_target_px
 from common.config import ArenaConfig
+from common.trajectory import BoolArray, Float32Array
 
 TARGETS = [(175.0, 300.0), (425.0, 300.0)]
 HIT = [True, False]
@@ -19,6 +20,15 @@ FREE = [False, False]
 def scene(*places: tuple[float, float], targets: list[tuple[float, float]] = TARGETS) -> Scene:
     robots = np.array([(x, y, 0.0) for x, y in places])
     return Scene(robots, np.array(targets))
+
+
+def judged(
+    scene: Scene, collided: BoolArray, frame: int, config: ArenaConfig
+) -> tuple[Float32Array, bool]:
+    """frame_rewards of one arena."""
+    stacked = Scene(scene.robots[None], scene.targets[None])
+    rewards, success = frame_rewards(stacked, collided[None], np.array([frame]), config)
+    return rewards[0], bool(success[0])
 
 
 def test_on_is_nearer_than_the_printed_root() -> None:
@@ -56,7 +66,7 @@ def test_rewards(
     expected: list[float],
     success: bool,
 ) -> None:
-    rewards, done = frame_rewards(scene(*places), np.array(collided), frame, ArenaConfig())
+    rewards, done = judged(scene(*places), np.array(collided), frame, ArenaConfig())
     assert rewards.dtype == np.float32
     np.testing.assert_allclose(rewards, expected, atol=1e-4)
     assert done is success
@@ -74,7 +84,7 @@ def test_rewards(
 def test_success_finds_a_target_for_each(places: list[tuple[float, float]], success: bool) -> None:
     targets = [(100.0, 100.0), (125.0, 100.0), (150.0, 100.0)]
     config = ArenaConfig(num_robots=3)
-    _, done = frame_rewards(scene(*places, targets=targets), np.zeros(3, np.bool_), 1, config)
+    _, done = judged(scene(*places, targets=targets), np.zeros(3, np.bool_), 1, config)
     assert done is success
 
 
@@ -87,7 +97,7 @@ def test_success_is_all_within_delta_of_targets_of_their_own(seed: int, num_robo
     places = targets + rng.uniform(-16, 16, (num_robots, 2))
     robots = np.concatenate([rng.permutation(places), np.zeros((num_robots, 1))], axis=1)
     collided = rng.random(num_robots) < 0.05
-    rewards, success = frame_rewards(Scene(robots, targets), collided, 1, config)
+    rewards, success = judged(Scene(robots, targets), collided, 1, config)
     near = np.linalg.norm(robots[:, None, :2] - targets, axis=2) < config.success_radius_px
     each = np.arange(num_robots)
     seated = any(near[each, list(order)].all() for order in permutations(range(num_robots)))

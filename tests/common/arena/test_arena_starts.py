@@ -8,9 +8,9 @@ import pytest
 
 from common.arena import (
     LEFT,
+    ArrayPhysics,
     Scene,
     Symmetry,
-    World,
     fixed_layout,
     layout_for,
     layout_symmetries,
@@ -105,16 +105,18 @@ def test_training_starts_are_legal(num_robots: int) -> None:
     rng = np.random.default_rng(0)
     targets = fixed_layout(num_robots)
     for _ in range(20):
-        World(config, training_start(config, targets, rng).robots)
+        ArrayPhysics(config, 1).place(0, training_start(config, targets, rng).robots)
 
 
 @pytest.mark.parametrize("layout", ["fixed", "random"])
 def test_test_starts_stay_clear_for_a_rotation(layout: str) -> None:
     config = ArenaConfig.model_validate({"num_robots": 4, "target_layout": layout})
     for start in starts.test_starts(config, 100, seed=3):
-        world = World(config, start.robots)
+        physics = ArrayPhysics(config, 1)
+        physics.place(0, start.robots)
         for _ in range(math.ceil(360 / 23)):
-            assert not world.move(np.full(4, LEFT, np.uint8)).any()
+            collided, _ = physics.move(np.array([0]), np.full((1, 4), LEFT, np.uint8))
+            assert not collided.any()
         assert Scene(start.robots, start.targets).targets.shape == (4, 2)
 
 

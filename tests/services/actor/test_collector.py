@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from common.arena import (
-    CountingArena,
+    CountingBatch,
     counting_frames,
     counting_outcome,
     counting_reward,
@@ -80,7 +80,7 @@ def make_network() -> QNetwork:
 def collect(steps: int, *, prioritized: bool = False) -> Collected:
     policy = WatchedPolicy(Policy(make_network()))
     origin = Origin("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
-    arenas = [CountingArena(CONFIG.arena, identity=index) for index in range(ARENAS)]
+    arenas = CountingBatch(CONFIG.arena, range(ARENAS))
     collector = Collector(
         CONFIG,
         origin,

@@ -1,0 +1,156 @@
+"""Many arenas stepped together: episode after episode of K robots that must stand on targets.
+
+Invariants: each arena is reset, then stepped until its LAST, then reset; every random number of an
+arena comes from its own generator, so a seed gives the same episodes in every process, whatever
+the other arenas do. Actions are LEFT, STRAIGHT, RIGHT of common.arena.scene.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from common.arena.actions import checked_actions
+from common.arena.codec import make_codec
+from common.arena.counting import CountingBatch
+from common.arena.layout import layout_for
+from common.arena.physics import ArrayPhysics, Physics
+from common.arena.pymunk_physics import PymunkPhysics
+from common.arena.rewards import frame_rewards
+from common.arena.scene import Scene, Start
+from common.arena.starts import training_start
+from common.config import ArenaConfig
+from common.trajectory import (
+    BoolArray,
+    Int64Array,
+    Outcome,
+    StepType,
+    TimeStep,
+    TimeSteps,
+)
+
+
+class ArenaBatch:
+    """The paper's arena (section 3), A times over."""
+
+    def __init__(
+        self,
+        config: ArenaConfig,
+        rngs: Sequence[np.random.Generator],
+        *,
+        max_collisions: int | None = None,
+    ) -> None:
+        """rngs: one an arena. max_collisions: robot collisions that end an episode; the
+        configuration's if None.
+
+        Raises ConfigError when robots or targets do not fit.
+        """
+        if max_collisions is not None and max_collisions < 1:
+            raise ValueError(f"max_collisions {max_collisions} would end episodes unplayed")
+        self._config = config
+        self._rngs = rngs
+        self._max_collisions = config.max_collisions if max_collisions is None else max_collisions
+        self._codec = make_codec(config)
+        self._physics = _make_physics(config, len(rngs))
+        self._targets = np.zeros((len(rngs), config.num_robots, 2))
+        self._running = np.zeros(len(rngs), np.bool_)
+        self._every = np.arange(len(rngs))
+        self.frames: Int64Array = np.zeros(len(rngs), np.int64)
+        """Frames of each arena's episode so far [A]."""
+        self.collisions: Int64Array = np.zeros(len(rngs), np.int64)
+        """Robot collisions of each arena's episode [A]: two when two robots run into one
+        another."""
+        for arena in range(len(rngs)):
+            self._place(arena, self._random_start(arena))
+
+    def __len__(self) -> int:
+        return len(self._rngs)
+
+    def scene(self, arena: int) -> Scene:
+        """The true state of an arena, a copy."""
+        return Scene(self._physics.robots[arena].copy(), self._targets[arena].copy())
+
+    def reset(self, arena: int, start: Start | None = None) -> TimeStep:
+        """Begins an episode of an arena, at random or at the given start.
+
+        Raises ValueError for a start with other shapes, or robots that overlap.
+        """
+        self._running[arena] = False
+        self._place(arena, self._random_start(arena) if start is None else start)
+        self._running[arena] = True
+        self.frames[arena] = self.collisions[arena] = 0
+        num_robots = self._config.num_robots
+        return TimeStep(
+            step_type=StepType.FIRST,
+            records=self._codec.encode(self.scene(arena)),
+            rewards=np.zeros(num_robots, np.float32),
+            discount=1.0,
+            collided=np.zeros(num_robots, np.bool_),
+            hit_wall=np.zeros(num_robots, np.bool_),
+        )
+
+    def step(self, actions: ArrayLike, arenas: Int64Array | None = None) -> TimeSteps:
+        """Plays one frame in all arenas, or in those of the numbers [N], each named once.
+
+        actions: [N, K] of LEFT, STRAIGHT, RIGHT. Raises ValueError for other actions, and when an
+        arena has no episode running.
+        """
+        arenas = self._every if arenas is None else arenas
+        if not self._running[arenas].all():
+            raise ValueError("the episode has ended or not begun: reset first")
+        checked = checked_actions(actions, (len(arenas), self._config.num_robots))
+        collided, hit_wall = self._physics.move(arenas, checked)
+        self.frames[arenas] += 1
+        self.collisions[arenas] += collided.sum(axis=1)
+        scene = Scene(self._physics.robots[arenas], self._targets[arenas])
+        rewards, success = frame_rewards(scene, collided, self.frames[arenas], self._config)
+        outcomes = self._outcomes(arenas, success)
+        self._running[arenas] = [outcome is None for outcome in outcomes]
+        return TimeSteps(
+            records=self._codec.encode(scene),
+            rewards=rewards,
+            collided=collided,
+            hit_wall=hit_wall,
+            outcomes=outcomes,
+        )
+
+    def _outcomes(self, arenas: Int64Array, success: BoolArray) -> tuple[Outcome | None, ...]:
+        failed = self.collisions[arenas] >= self._max_collisions
+        late = self.frames[arenas] >= self._config.max_frames
+        outcomes: list[Outcome | None] = [None] * len(arenas)
+        for i in np.flatnonzero(success | failed | late).tolist():
+            if success[i]:
+                outcomes[i] = Outcome.SUCCESS
+            else:
+                outcomes[i] = Outcome.COLLISION if failed[i] else Outcome.TIMEOUT
+        return tuple(outcomes)
+
+    def _random_start(self, arena: int) -> Start:
+        rng = self._rngs[arena]
+        return training_start(self._config, layout_for(self._config, rng), rng)
+
+    def _place(self, arena: int, start: Start) -> None:
+        shape = (self._config.num_robots, 3)
+        if start.robots.shape != shape or start.targets.shape != (shape[0], 2):
+            raise ValueError(
+                f"start has robots {start.robots.shape} and targets {start.targets.shape}; "
+                f"this arena has {shape[0]} of each"
+            )
+        if not np.isfinite(start.targets).all():
+            raise ValueError(f"start has targets {start.targets.tolist()}")
+        self._physics.place(arena, start.robots)
+        self._targets[arena] = start.targets
+
+
+def make_arenas(
+    config: ArenaConfig, rngs: Sequence[np.random.Generator], identities: Sequence[int]
+) -> ArenaBatch | CountingBatch:
+    """The arenas that config.kind names; identities is what counting arenas' pictures carry."""
+    if config.kind == "counting":
+        return CountingBatch(config, identities)
+    return ArenaBatch(config, rngs)
+
+
+def _make_physics(config: ArenaConfig, num_arenas: int) -> Physics:
+    physics = ArrayPhysics if config.physics == "array" else PymunkPhysics
+    return physics(config, num_arenas)
