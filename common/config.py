@@ -44,7 +44,9 @@ class ArenaConfig(Section):
     """What moves the robots: compiled arrays, or pymunk, which is the reference; both give the same
     poses. (ours; ancestor: pymunk)"""
     num_robots: Annotated[int, Field(ge=1, le=10)] = 2
-    """Robots, and as many targets. (paper: 2, 3, 4)"""
+    """(paper: 2, 3, 4)"""
+    num_targets: Annotated[int, Field(ge=0, le=20)] = 0
+    """Targets, of which every robot needs one; 0: as many as robots. (paper: as many as robots)"""
     size_px: Annotated[int, Field(ge=120)] = 600
     """Width and height of the square arena. (paper)"""
     wall_offset_px: Annotated[float, Field(ge=0)] = 10
@@ -63,7 +65,7 @@ class ArenaConfig(Section):
     """`fixed`: one layout for each number of robots; `random`: anew each episode. (ours: the
     paper calls only the robots' start random)"""
     targets_px: tuple[tuple[float, float], ...] = ()
-    """Target centres (x, y) instead of the built-in fixed layout; one a robot. (ours)"""
+    """Target centres (x, y) instead of the built-in fixed layout. (ours)"""
     success_radius_px: Positive = 20
     """delta: every robot this near to a target of its own is success. (paper)"""
     max_collisions: Count = 5
@@ -99,11 +101,16 @@ class ArenaConfig(Section):
     """What an observation record holds: poses from which the picture is drawn, or pixels. (ours)"""
 
     @property
+    def target_count(self) -> int:
+        """Targets of an episode."""
+        return self.num_targets or self.num_robots
+
+    @property
     def record_bytes(self) -> int:
         """Length of one observation record: the pixels, or own pose, other poses and targets."""
         if self.codec == "frames":
             return self.view_px * self.view_px
-        return 4 * (3 * self.num_robots + 2 * self.num_robots)
+        return 4 * (3 * self.num_robots + 2 * self.target_count)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -112,10 +119,16 @@ class ArenaConfig(Section):
             raise ValueError(
                 f"no robot of radius {self.robot_radius_px} px fits inside walls {inner} px apart"
             )
-        if self.targets_px and len(self.targets_px) != self.num_robots:
+        if self.target_count < self.num_robots:
+            raise ValueError(
+                f"num_targets {self.num_targets} leaves {self.num_robots} robots without a target "
+                "each; give as many as robots or more, or 0"
+            )
+        if self.targets_px and len(self.targets_px) != self.target_count:
             raise ValueError(
                 f"targets_px has {len(self.targets_px)} targets for {self.num_robots} robots; "
-                "give one a robot"
+                f"give {self.target_count}"
+                + (", one a robot, or set num_targets" if not self.num_targets else "")
             )
         if self.codec == "scene" and self.kind == "counting":
             raise ValueError('kind = "counting" encodes its counters in pixels: codec = "frames"')

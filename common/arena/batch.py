@@ -52,7 +52,7 @@ class ArenaBatch:
         self._max_collisions = config.max_collisions if max_collisions is None else max_collisions
         self._codec = make_codec(config)
         self._physics = _make_physics(config, len(rngs))
-        self._targets = np.zeros((len(rngs), config.num_robots, 2))
+        self._targets = np.zeros((len(rngs), config.target_count, 2))
         self._running = np.zeros(len(rngs), np.bool_)
         self._every = np.arange(len(rngs))
         self.frames: Int64Array = np.zeros(len(rngs), np.int64)
@@ -130,11 +130,11 @@ class ArenaBatch:
         return training_start(self._config, layout_for(self._config, rng), rng)
 
     def _place(self, arena: int, start: Start) -> None:
-        shape = (self._config.num_robots, 3)
-        if start.robots.shape != shape or start.targets.shape != (shape[0], 2):
+        num_robots, num_targets = self._config.num_robots, self._config.target_count
+        if start.robots.shape != (num_robots, 3) or start.targets.shape != (num_targets, 2):
             raise ValueError(
                 f"start has robots {start.robots.shape} and targets {start.targets.shape}; "
-                f"this arena has {shape[0]} of each"
+                f"this arena has {num_robots} and {num_targets}"
             )
         if not np.isfinite(start.targets).all():
             raise ValueError(f"start has targets {start.targets.tolist()}")

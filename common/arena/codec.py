@@ -41,7 +41,8 @@ class SceneCodec:
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
         num = config.num_robots
-        self.record_bytes = _NUMBER.itemsize * 5 * num
+        self._num_numbers = 3 * num + 2 * config.target_count
+        self.record_bytes = _NUMBER.itemsize * self._num_numbers
         self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
         self._views = AnalyticViews(config) if config.renderer == "analytic" else None
 
@@ -51,9 +52,9 @@ class SceneCodec:
     def encode(self, scene: Scene) -> UInt8Array:
         num = len(self._order)
         leading = scene.robots.shape[:-2]
-        numbers = np.empty((*leading, num, 5 * num), _NUMBER)
+        numbers = np.empty((*leading, num, self._num_numbers), _NUMBER)
         numbers[..., : 3 * num] = scene.robots[..., self._order, :].reshape(*leading, num, 3 * num)
-        numbers[..., 3 * num :] = scene.targets.reshape(*leading, 1, 2 * num)
+        numbers[..., 3 * num :] = scene.targets.reshape(*leading, 1, -1)
         return numbers.view(np.uint8)
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:

@@ -15,7 +15,9 @@ from common.errors import ConfigError
 from common.trajectory import Float64Array
 
 _LAYOUT_SIZE_PX = 600
-_TRIES = 2000
+_TRIES = 2000  # of all targets at once
+_CANDIDATES = 64  # places drawn at once for one target
+_RESTARTS = 200  # of targets drawn one after the other
 _WALL_MARGIN_PX = 5.0
 
 _FIXED: dict[int, tuple[tuple[float, float], ...]] = {
@@ -36,18 +38,21 @@ _FIXED: dict[int, tuple[tuple[float, float], ...]] = {
 }
 
 
-def fixed_layout(num_robots: int) -> Float64Array:
-    """Target centres [K, 2] px of the built-in layout in an arena of 600 px.
+def fixed_layout(num_targets: int) -> Float64Array:
+    """Target centres [M, 2] px of the built-in layout in an arena of 600 px.
 
     Raises ConfigError for a number without a layout.
     """
-    if num_robots not in _FIXED:
-        raise ConfigError(f"no fixed layout for {num_robots} robots; there is one for 1 to 10")
-    return np.array(_FIXED[num_robots], np.float64)
+    if num_targets not in _FIXED:
+        raise ConfigError(
+            f"no fixed layout for {num_targets} targets; there is one for 1 to 10: give targets_px "
+            'or target_layout = "random"'
+        )
+    return np.array(_FIXED[num_targets], np.float64)
 
 
 def layout_for(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
-    """Target centres [K, 2] px for the next episode: the fixed ones, or drawn with rng.
+    """Target centres [M, 2] px for the next episode: the fixed ones, or drawn with rng.
 
     Raises ConfigError when no such layout fits, naming what does not.
     """
@@ -61,7 +66,7 @@ def _given_layout(config: ArenaConfig) -> Float64Array:
     if config.targets_px:
         targets = np.array(config.targets_px, np.float64)
     else:
-        targets = fixed_layout(config.num_robots) * (config.size_px / _LAYOUT_SIZE_PX)
+        targets = fixed_layout(config.target_count) * (config.size_px / _LAYOUT_SIZE_PX)
     _check_solvable(config, targets)
     return targets
 
@@ -109,14 +114,37 @@ def _random_layout(config: ArenaConfig, rng: np.random.Generator) -> Float64Arra
     low, high = reachable_px(config)
     low, high = low + _WALL_MARGIN_PX, high - _WALL_MARGIN_PX
     apart = 2 * config.robot_radius_px + 2 * config.success_radius_px
-    for _ in range(_TRIES if high >= low else 0):
-        targets = rng.uniform(low, high, (config.num_robots, 2))
-        if _nearest_pair_px(targets) >= apart:
-            return targets
+    if config.target_count == config.num_robots:
+        for _ in range(_TRIES if high >= low else 0):
+            targets = rng.uniform(low, high, (config.num_robots, 2))
+            if _nearest_pair_px(targets) >= apart:
+                return targets
+    else:
+        scattered = _scattered(config.target_count, low, high, apart, rng)
+        if scattered is not None:
+            return scattered
     raise ConfigError(
-        f"{config.num_robots} random targets {apart:g} px apart do not fit in an arena of "
-        f"{config.size_px} px; fewer robots or a larger arena"
+        f"{config.target_count} random targets {apart:g} px apart do not fit in an arena of "
+        f"{config.size_px} px; fewer targets or a larger arena"
     )
+
+
+def _scattered(
+    num: int, low: float, high: float, apart: float, rng: np.random.Generator
+) -> Float64Array | None:
+    """Places [num, 2] drawn one after the other, each `apart` from all before; None: no room."""
+    for _ in range(_RESTARTS if high >= low else 0):
+        places = np.empty((0, 2))
+        while len(places) < num:
+            candidates = rng.uniform(low, high, (_CANDIDATES, 2))
+            gaps = np.hypot(*(candidates[:, None] - places[None]).transpose(2, 0, 1))
+            free = (gaps >= apart).all(axis=1)
+            if not free.any():
+                break
+            places = np.concatenate([places, candidates[None, free.argmax()]])
+        else:
+            return places
+    return None
 
 
 def _check_solvable(config: ArenaConfig, targets: Float64Array) -> None:

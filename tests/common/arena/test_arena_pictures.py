@@ -30,6 +30,7 @@ def test_analytic_is_what_opencv_draws(crop_px: int, orientation: str) -> None:
     config = ArenaConfig.model_validate(
         {
             "num_robots": 4,
+            "num_targets": 5,
             "target_layout": "random",
             "crop_px": crop_px,
             "orientation": orientation,

@@ -89,18 +89,23 @@ def test_success_finds_a_target_for_each(places: list[tuple[float, float]], succ
 
 
 @settings(max_examples=300)
-@given(seed=st.integers(0, 2**32 - 1), num_robots=st.integers(1, 5))
-def test_success_is_all_within_delta_of_targets_of_their_own(seed: int, num_robots: int) -> None:
+@given(seed=st.integers(0, 2**32 - 1), num_robots=st.integers(1, 4), spare=st.integers(0, 3))
+def test_success_is_all_within_delta_of_targets_of_their_own(
+    seed: int, num_robots: int, spare: int
+) -> None:
     rng = np.random.default_rng(seed)
-    config = ArenaConfig(num_robots=num_robots)
-    targets = rng.uniform(280, 280 + 10 * num_robots, (num_robots, 2))
-    places = targets + rng.uniform(-16, 16, (num_robots, 2))
+    num_targets = num_robots + spare
+    config = ArenaConfig(num_robots=num_robots, num_targets=num_targets)
+    targets = rng.uniform(280, 280 + 10 * num_targets, (num_targets, 2))
+    places = rng.permutation(targets)[:num_robots] + rng.uniform(-16, 16, (num_robots, 2))
     robots = np.concatenate([rng.permutation(places), np.zeros((num_robots, 1))], axis=1)
     collided = rng.random(num_robots) < 0.05
     rewards, success = judged(Scene(robots, targets), collided, 1, config)
     near = np.linalg.norm(robots[:, None, :2] - targets, axis=2) < config.success_radius_px
     each = np.arange(num_robots)
-    seated = any(near[each, list(order)].all() for order in permutations(range(num_robots)))
+    seated = any(
+        near[each, list(order)].all() for order in permutations(range(num_targets), num_robots)
+    )
     assert success is (seated and not collided.any())
     assert (rewards == config.success_reward).all() == success
     assert (rewards[collided] == config.collision_reward).all()

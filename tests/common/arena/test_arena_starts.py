@@ -38,7 +38,7 @@ def test_fixed_layouts_leave_room(num_robots: int) -> None:
 def test_fixed_layouts_of_the_trial() -> None:
     assert fixed_layout(2).tolist() == [[175, 300], [425, 300]]
     assert {tuple(t) for t in fixed_layout(4).tolist()} == set(product((175, 425), repeat=2))
-    with pytest.raises(ConfigError, match="11 robots"):
+    with pytest.raises(ConfigError, match="11 targets"):
         fixed_layout(11)
 
 
@@ -57,6 +57,19 @@ def test_random_layouts_leave_room() -> None:
         assert nearest_pair(targets) >= 90
         assert targets.min() >= 42
         assert targets.max() <= 558
+
+
+@pytest.mark.parametrize("num_targets", [6, 10, 20])
+def test_more_targets_than_robots(num_targets: int) -> None:
+    config = ArenaConfig(num_robots=4, num_targets=num_targets, target_layout="random")
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        targets = layout_for(config, rng)
+        assert targets.shape == (num_targets, 2)
+        assert nearest_pair(targets) >= 90
+    assert starts.test_starts(config, 2, seed=0)[0].targets.shape == (num_targets, 2)
+    with pytest.raises(ConfigError, match="30 random targets"):
+        layout_for(config.model_copy(update={"num_targets": 30}), rng)
 
 
 @pytest.mark.parametrize(
