@@ -37,6 +37,22 @@ class TwoSides(RuleBasedStateMachine):
             if self.limiter.can_sample(count):
                 self.limiter.samples += count
 
+    @rule(lost=st.integers(0, 500), ratio=st.sampled_from([0.5, 1.0, 4.0, 8.0]))
+    def go_on_in_another_process(self, lost: int, ratio: float) -> None:
+        """The last samples were not noted, and the ratio may be another now."""
+        before = self.limiter
+        tolerance = before.error_buffer / (before.min_size * before.samples_per_insert)
+        self.limiter = RateLimiter.with_tolerance(
+            ratio, before.min_size, tolerance, self.largest_insert, self.largest_sample
+        )
+        if before.inserts < before.min_size:
+            self.limiter.resume(before.inserts)
+        else:
+            self.limiter.restore(before.inserts, max(before.samples - lost, 0))
+        assert self.limiter.inserts == before.inserts
+        if ratio == before.samples_per_insert and lost == 0:
+            assert self.limiter.samples == before.samples
+
     @invariant()
     def samples_stay_within_the_buffer(self) -> None:
         limiter = self.limiter

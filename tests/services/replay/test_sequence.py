@@ -1,6 +1,9 @@
 """What sequence numbers say of chunks."""
 
 import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from services.replay.sequence import Arrival, SequenceBook
 
@@ -47,3 +50,43 @@ def test_the_stream_heard_of_least_recently_is_forgotten() -> None:
     assert book.classify("a", 1, 1) is Arrival.REPEATED
     assert book.classify("c", 1, 0) is Arrival.REPEATED
     assert book.classify("b", 1, 0) is Arrival.NEXT
+
+
+class BookAgainstList(RuleBasedStateMachine):
+    """Every chunk ever stored stands in a list, of the streams that are not forgotten."""
+
+    @initialize(max_streams=st.integers(1, 4))
+    def make(self, max_streams: int) -> None:
+        self.book = SequenceBook(max_streams)
+        self.max_streams = max_streams
+        self.stored: list[tuple[tuple[str, int], int]] = []
+
+    @rule(
+        actor=st.sampled_from("ab"),
+        incarnation=st.integers(1, 3),
+        sequence=st.integers(0, 5),
+        ahead=st.booleans(),
+    )
+    def arrive(self, actor: str, incarnation: int, sequence: int, ahead: bool) -> None:
+        """As the service does: what is new is stored, what was there before is not."""
+        stream = (actor, incarnation)
+        known = [n for of, n in self.stored if of == stream]
+        newest = max(known, default=-1)
+        sequence += newest + 1 if ahead else 0
+        arrival = self.book.classify(actor, incarnation, sequence)
+        if sequence <= newest:
+            assert arrival is Arrival.REPEATED
+            return
+        assert arrival is (Arrival.NEXT if sequence == newest + 1 else Arrival.GAP)
+        self.book.record(actor, incarnation, sequence)
+        self.stored.append((stream, sequence))
+        latest = list(dict.fromkeys(of for of, _ in reversed(self.stored)))[: self.max_streams]
+        self.stored = [(of, n) for of, n in self.stored if of in latest]
+
+    @invariant()
+    def remembers_no_more_than_it_may(self) -> None:
+        assert len(self.book._last) == len({of for of, _ in self.stored}) <= self.max_streams
+
+
+TestBookAgainstList = BookAgainstList.TestCase
+TestBookAgainstList.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

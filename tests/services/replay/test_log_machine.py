@@ -1,0 +1,156 @@
+"""The segment log against a plain list of what was acknowledged, whatever cuts writers off."""
+
+import errno
+import os
+import shutil
+import tempfile
+from itertools import islice
+from pathlib import Path
+from unittest import mock
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from services.replay.log import SegmentLog, read_segment, segment_paths
+
+PER_PAYLOAD = 10  # transitions that each payload stands for
+
+
+class LogAgainstList(RuleBasedStateMachine):
+    """Payloads are unlike one another; the list holds those that must come back, oldest first."""
+
+    @initialize(segment_bytes=st.integers(1, 400), fsync=st.booleans())
+    def make(self, segment_bytes: int, fsync: bool) -> None:
+        self.directory = Path(tempfile.mkdtemp())
+        self.segment_bytes, self.fsync = segment_bytes, fsync
+        self.model: list[bytes] = []
+        self.count = 0
+        self.corrupt = 0
+        self.start()
+
+    def start(self) -> None:
+        """A new process opens the log; the one before it was killed, or closed it."""
+        self.log = SegmentLog(self.directory, segment_bytes=self.segment_bytes, fsync=self.fsync)
+        self.found: list[bytes] = []
+        self.first = self.log.first_key
+        for payload in self.log.recover(lambda: self.key(len(self.found))):
+            self.found.append(payload)
+
+    def key(self, index: int) -> int:
+        return self.first + PER_PAYLOAD * index
+
+    def payload(self, size: int) -> bytes:
+        self.count += 1
+        return self.count.to_bytes(4, "big") + bytes([self.count % 255 + 1]) * size
+
+    @rule(sizes=st.lists(st.integers(1, 150), min_size=1, max_size=6))
+    def append(self, sizes: list[int]) -> None:
+        for size in sizes:
+            payload = self.payload(size)
+            self.log.append(payload, self.key(len(self.model)), PER_PAYLOAD)
+            self.model.append(payload)
+
+    @rule(size=st.integers(1, 150), written=st.integers(0, 20))
+    def append_to_a_full_disk(self, size: int, written: int) -> None:
+        real = os.write
+
+        def full(descriptor: int, data: bytes) -> int:
+            real(descriptor, bytes(data)[:written])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with mock.patch("os.write", full):
+            try:
+                self.log.append(self.payload(size), self.key(len(self.model)), PER_PAYLOAD)
+            except OSError:
+                return
+        raise AssertionError("a failed write was taken for a whole one")
+
+    @rule(close=st.booleans())
+    def start_again(self, close: bool) -> None:
+        if close:
+            self.log.close()
+        self.start()
+        assert self.found == self.model
+        assert self.log.corrupt == self.corrupt
+
+    @rule(data=st.data())
+    def die_in_a_write(self, data: st.DataObject) -> None:
+        """Of the record under way some bytes are there, or zeros where they were to be."""
+        if not (paths := segment_paths(self.directory)):
+            return
+        record = len(payload := self.payload(30)).to_bytes(4, "little") + b"crc?" + payload
+        tail = record[: data.draw(st.integers(1, len(record) - 1))]
+        with paths[-1].open("ab") as file:
+            file.write(data.draw(st.sampled_from([tail, bytes(len(tail))])))
+        self.start_again(False)
+
+    @precondition(lambda self: self.model)
+    @rule(data=st.data())
+    def flip_a_bit_of_a_payload(self, data: st.DataObject) -> None:
+        """That record is lost, and no other."""
+        index = data.draw(st.integers(0, len(self.model) - 1))
+        payload = self.model.pop(index)
+        self.flip(payload, data.draw(st.integers(-32, 8 * len(payload) - 1)))  # its CRC too
+        self.corrupt += 1
+        self.start_again(False)
+
+    @precondition(lambda self: self.model)
+    @rule(data=st.data())
+    def flip_a_bit_of_a_length(self, data: st.DataObject) -> None:
+        """Where the next record begins is not known: those of the same file may go with it."""
+        index = data.draw(st.integers(0, len(self.model) - 1))
+        payload = self.model[index]
+        path = self.flip(payload, data.draw(st.integers(-64, -33)))
+        before = {record for _, _, record in read_segment(path)}
+        self.start()
+        lost = [record for record in self.model if record not in self.found]
+        assert [record for record in self.model if record not in lost] == self.found
+        assert payload in lost
+        assert lost == self.model[index : index + len(lost)]
+        assert before <= {*self.found, None}
+        self.model = self.found
+        self.corrupt = self.log.corrupt
+
+    def flip(self, payload: bytes, bit: int) -> Path:
+        """The segment with one bit changed, counted from where the payload begins."""
+        for path in segment_paths(self.directory):
+            data = bytearray(path.read_bytes())
+            if (place := data.find(payload)) >= 0:
+                data[place + bit // 8] ^= 1 << bit % 8
+                path.write_bytes(data)
+                return path
+        raise AssertionError("an acknowledged payload is in no file")
+
+    @precondition(lambda self: self.model)
+    @rule(data=st.data())
+    def forget(self, data: st.DataObject) -> None:
+        """Whole files go, and only of what is older than the key."""
+        index = data.draw(st.integers(0, len(self.model)))
+        self.log.forget(self.key(index))
+        there = b"".join(path.read_bytes() for path in segment_paths(self.directory))
+        kept = [payload for payload in self.model if payload in there]
+        assert kept == self.model[len(self.model) - len(kept) :]
+        assert len(kept) >= len(self.model) - index
+        self.first += PER_PAYLOAD * (len(self.model) - len(kept))
+        self.model = kept
+        self.corrupt = 0
+        for path in segment_paths(self.directory):
+            self.corrupt += sum(payload is None for _, _, payload in read_segment(path))
+
+    @invariant()
+    def a_reader_beside_it_sees_what_is_acknowledged(self) -> None:
+        seen = (
+            payload for path in segment_paths(self.directory) for *_, payload in read_segment(path)
+        )
+        whole = (payload for payload in seen if payload is not None)
+        assert list(islice(whole, len(self.model) + 1)) == self.model
+
+    def teardown(self) -> None:
+        if hasattr(self, "log"):
+            self.log.close()
+            shutil.rmtree(self.directory)
+
+
+TestLogAgainstList = LogAgainstList.TestCase
+TestLogAgainstList.settings = settings(max_examples=60, stateful_step_count=20, deadline=None)
