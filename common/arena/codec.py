@@ -54,7 +54,8 @@ class SceneCodec:
         leading = scene.robots.shape[:-2]
         numbers = np.empty((*leading, num, self._num_numbers), _NUMBER)
         numbers[..., : 3 * num] = scene.robots[..., self._order, :].reshape(*leading, num, 3 * num)
-        numbers[..., 3 * num :] = scene.targets.reshape(*leading, 1, -1)
+        targets_shape = (*leading, 1, self._num_numbers - 3 * num)
+        numbers[..., 3 * num :] = scene.targets.reshape(targets_shape)
         return numbers.view(np.uint8)
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:

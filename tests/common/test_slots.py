@@ -15,6 +15,7 @@ from common.config import TransportConfig
 from common.errors import DeadlineError, HeldError, SlotError
 from common.transport import Request, Server, Session, free_endpoint
 from common.transport.slots import LARGE_BYTES, Lender, Slot, Slots, put, room
+from tests.common.test_transport import until_served
 
 _DEADLINE_S = 20.0
 KEY = "mrcdrl/slots/query"
@@ -124,6 +125,7 @@ class Pair:
 
     def __init__(self, server_session: Session, client_session: Session) -> None:
         self.server: Server = server_session.server(KEY)
+        until_served(client_session, KEY, self.server)
         self.client = client_session.client(KEY, "the peer", lends=True)
         self.lender: Lender = self.client._lender
         self.thread = ThreadPoolExecutor(1)

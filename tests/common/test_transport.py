@@ -13,7 +13,7 @@ from common.errors import DeadlineError, EndpointError, HeldError, RefusedError
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Weights
-from common.transport import Publisher, Server, Session, free_endpoint
+from common.transport import Client, Publisher, Server, Session, free_endpoint
 from common.weights import WeightsReader, WeightsWriter
 
 _DEADLINE_S = 20.0
@@ -36,6 +36,13 @@ class Network:
         session = Session(config)
         self._sessions.append(session)
         return session
+
+    def pair(self, *, capacity: int = 256, timeout_s: float = 5.0) -> tuple[Server, Client]:
+        """A server, and a client that reaches it already."""
+        self.server_session, session = self.join(), self.join()
+        server = self.server_session.server(KEY, capacity)
+        until_served(session, KEY, server)
+        return server, session.client(KEY, "the peer", timeout_s)
 
     def close(self) -> None:
         for session in reversed(self._sessions):
@@ -64,6 +71,21 @@ def small_network(router: str) -> Iterator[Network]:
     opened.close()
 
 
+def until_served(session: Session, key: str, server: Server) -> None:
+    """Wait until queries of the session reach the server: declarations travel, too."""
+    probe = session.client(key, "the server")
+    deadline = time.monotonic() + _DEADLINE_S
+    while True:
+        probe.ask(b"probe")
+        request = server.take(0.2)
+        if request is not None:
+            break
+        assert time.monotonic() < deadline, "no query arrived"
+    while request is not None:  # those that were late
+        request.reply(b"")
+        request = server.take(0.1)
+
+
 def eventually(found: Callable[[], object]) -> None:
     """Wait, without polling blindly, until it is so; fails at the deadline."""
     waiter, deadline = threading.Event(), time.monotonic() + _DEADLINE_S
@@ -86,8 +108,7 @@ def answer_next(server: Server, answer: str, text: str) -> bytes:
 
 
 def test_a_query_is_answered_across_the_router(network: Network) -> None:
-    server = network.join().server(KEY)
-    client = network.join().client(KEY, "the peer")
+    server, client = network.pair()
     with ThreadPoolExecutor(1) as other:
         taken = other.submit(answer_next, server, "reply", "back")
         assert client.ask(b"there").result() == b"back"
@@ -95,8 +116,7 @@ def test_a_query_is_answered_across_the_router(network: Network) -> None:
 
 
 def test_several_queries_may_be_under_way(network: Network) -> None:
-    server = network.join().server(KEY)
-    client = network.join().client(KEY, "the peer")
+    server, client = network.pair()
     pending = [client.ask(str(number).encode()) for number in range(5)]
     requests = [server.take(_DEADLINE_S) for _ in pending]
     for request in reversed(requests):
@@ -106,8 +126,7 @@ def test_several_queries_may_be_under_way(network: Network) -> None:
 
 
 def test_a_refusal_brings_its_reason(network: Network) -> None:
-    server = network.join().server(KEY)
-    client = network.join().client(KEY, "the peer")
+    server, client = network.pair()
     with ThreadPoolExecutor(1) as other:
         other.submit(answer_next, server, "refuse", "wrong arena")
         with pytest.raises(RefusedError, match=r"^the peer refused: wrong arena$") as refused:
@@ -116,8 +135,7 @@ def test_a_refusal_brings_its_reason(network: Network) -> None:
 
 
 def test_a_held_request_is_told_from_a_refused_one(network: Network) -> None:
-    server = network.join().server(KEY)
-    client = network.join().client(KEY, "the peer")
+    server, client = network.pair()
     with ThreadPoolExecutor(1) as other:
         other.submit(answer_next, server, "hold", "not yet")
         with pytest.raises(HeldError, match=r"^not yet$"):
@@ -133,8 +151,7 @@ def test_where_nobody_serves_the_answer_is_at_once_a_deadline_error(network: Net
 
 
 def test_a_silent_peer_is_given_up_at_the_timeout(network: Network) -> None:
-    server = network.join().server(KEY)
-    client = network.join().client(KEY, "the peer", timeout_s=0.3)
+    server, client = network.pair(timeout_s=0.3)
     before = time.monotonic()
     pending = client.ask(b"")
     request = server.take(_DEADLINE_S)
@@ -146,20 +163,17 @@ def test_a_silent_peer_is_given_up_at_the_timeout(network: Network) -> None:
 
 
 def test_a_peer_that_leaves_is_given_up(network: Network) -> None:
-    peer = network.join()
-    server = peer.server(KEY)
-    client = network.join().client(KEY, "the peer", timeout_s=2.0)
+    server, client = network.pair(timeout_s=2.0)
     pending = client.ask(b"")
     request = server.take(_DEADLINE_S)
     assert request is not None
-    peer.close()
+    network.server_session.close()
     with pytest.raises(DeadlineError, match="no answer from the peer"):
         pending.result()
 
 
 def test_a_request_that_is_too_large_is_refused(small_network: Network) -> None:
-    server = small_network.join().server(KEY)
-    client = small_network.join().client(KEY, "the peer")
+    server, client = small_network.pair()
     with pytest.raises(RefusedError, match="1001 bytes exceed the limit of 1000"):
         client.ask(b"x" * 1001).result()
     assert server.refused == 1
@@ -167,8 +181,7 @@ def test_a_request_that_is_too_large_is_refused(small_network: Network) -> None:
 
 
 def test_an_answer_that_is_too_large_is_refused(small_network: Network) -> None:
-    server = small_network.join().server(KEY)
-    client = small_network.join().client(KEY, "the peer")
+    server, client = small_network.pair()
     with ThreadPoolExecutor(1) as other:
         other.submit(answer_next, server, "reply", "x" * 1001)
         with pytest.raises(RefusedError, match="the answer of the peer exceeds 1000 bytes"):
@@ -176,8 +189,7 @@ def test_an_answer_that_is_too_large_is_refused(small_network: Network) -> None:
 
 
 def test_a_full_server_holds_further_requests(network: Network) -> None:
-    server = network.join().server(KEY, capacity=1)
-    client = network.join().client(KEY, "the peer")
+    server, client = network.pair(capacity=1)
     first = client.ask(b"first")
     with pytest.raises(HeldError, match="1 requests are waiting"):
         client.ask(b"second").result()

@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from unittest import mock
@@ -55,11 +56,14 @@ class LogAgainstList(RuleBasedStateMachine):
     def append_to_a_full_disk(self, size: int, written: int) -> None:
         real = os.write
 
+        def short(descriptor: int, parts: Sequence[bytes]) -> int:
+            record = b"".join(parts)
+            return real(descriptor, record[: min(written, len(record) - 1)])
+
         def full(descriptor: int, data: bytes) -> int:
-            real(descriptor, bytes(data)[:written])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        with mock.patch("os.write", full):
+        with mock.patch("os.writev", short), mock.patch("os.write", full):
             try:
                 self.log.append(self.payload(size), self.key(len(self.model)), PER_PAYLOAD)
             except OSError:
