@@ -66,6 +66,15 @@ class ArenaConfig(Section):
     paper calls only the robots' start random)"""
     targets_px: tuple[tuple[float, float], ...] = ()
     """Target centres (x, y) instead of the built-in fixed layout. (ours)"""
+    obstacles_px: tuple[tuple[float, float, float], ...] = ()
+    """Discs (x, y, radius) that stop robots as walls do. (ours)"""
+    num_obstacles: Annotated[int, Field(ge=0, le=20)] = 0
+    """Discs besides, at random places anew each episode; robots can always pass between them.
+    (ours)"""
+    obstacle_radius_px: Positive = 30
+    """Of the random discs. (ours)"""
+    inner_walls_px: tuple[tuple[float, float, float, float], ...] = ()
+    """Walls (x, y, x, y) from one point to another, as thick as the outer ones. (ours)"""
     success_radius_px: Positive = 20
     """delta: every robot this near to a target of its own is success. (paper)"""
     max_collisions: Count = 5
@@ -106,11 +115,16 @@ class ArenaConfig(Section):
         return self.num_targets or self.num_robots
 
     @property
+    def obstacle_count(self) -> int:
+        """Discs of an episode."""
+        return len(self.obstacles_px) + self.num_obstacles
+
+    @property
     def record_bytes(self) -> int:
-        """Length of one observation record: the pixels, or own pose, other poses and targets."""
+        """Length of one observation record: the pixels, or poses, targets and obstacles."""
         if self.codec == "frames":
             return self.view_px * self.view_px
-        return 4 * (3 * self.num_robots + 2 * self.target_count)
+        return 4 * (3 * self.num_robots + 2 * self.target_count + 3 * self.obstacle_count)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -130,6 +144,17 @@ class ArenaConfig(Section):
                 f"give {self.target_count}"
                 + (", one a robot, or set num_targets" if not self.num_targets else "")
             )
+        if (self.obstacle_count or self.inner_walls_px) and (
+            self.step_px >= 2 * self.robot_radius_px
+        ):
+            raise ValueError(
+                f"step_px {self.step_px:g} is not below a robot's width: it would jump over "
+                "obstacles and inner walls"
+            )
+        if any(radius <= 0 for _, _, radius in self.obstacles_px):
+            raise ValueError("obstacles_px has a radius that is not above 0")
+        if any(wall[:2] == wall[2:] for wall in self.inner_walls_px):
+            raise ValueError("inner_walls_px has a wall without length: give two points")
         if self.codec == "scene" and self.kind == "counting":
             raise ValueError('kind = "counting" encodes its counters in pixels: codec = "frames"')
         return self

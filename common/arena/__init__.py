@@ -20,7 +20,7 @@ from common.arena.physics import ArrayPhysics, Physics
 from common.arena.pymunk_physics import PymunkPhysics
 from common.arena.rendering import draw_arena, literal_views
 from common.arena.rewards import frame_rewards, target_distances_px
-from common.arena.scene import LEFT, RIGHT, STRAIGHT, Scene, Start
+from common.arena.scene import LEFT, RIGHT, STRAIGHT, Layout, Scene, Start
 from common.arena.starts import test_starts, training_start
 from common.arena.symmetry import IDENTITY, Symmetry
 from common.arena.views import AnalyticViews
@@ -38,6 +38,7 @@ __all__ = [
     "CountingArena",
     "CountingBatch",
     "FrameCodec",
+    "Layout",
     "ObservationCodec",
     "Physics",
     "PymunkPhysics",

@@ -53,6 +53,7 @@ class ArenaBatch:
         self._codec = make_codec(config)
         self._physics = _make_physics(config, len(rngs))
         self._targets = np.zeros((len(rngs), config.target_count, 2))
+        self._obstacles = np.zeros((len(rngs), config.obstacle_count, 3))
         self._running = np.zeros(len(rngs), np.bool_)
         self._every = np.arange(len(rngs))
         self.frames: Int64Array = np.zeros(len(rngs), np.int64)
@@ -68,7 +69,7 @@ class ArenaBatch:
 
     def scene(self, arena: int) -> Scene:
         """The true state of an arena, a copy."""
-        return Scene(self._physics.robots[arena].copy(), self._targets[arena].copy())
+        return self._scenes(np.array(arena))
 
     def reset(self, arena: int, start: Start | None = None) -> TimeStep:
         """Begins an episode of an arena, at random or at the given start.
@@ -102,7 +103,7 @@ class ArenaBatch:
         collided, hit_wall = self._physics.move(arenas, checked)
         self.frames[arenas] += 1
         self.collisions[arenas] += collided.sum(axis=1)
-        scene = Scene(self._physics.robots[arenas], self._targets[arenas])
+        scene = self._scenes(arenas)
         rewards, success = frame_rewards(scene, collided, self.frames[arenas], self._config)
         outcomes = self._outcomes(arenas, success)
         self._running[arenas] = [outcome is None for outcome in outcomes]
@@ -113,6 +114,10 @@ class ArenaBatch:
             hit_wall=hit_wall,
             outcomes=outcomes,
         )
+
+    def _scenes(self, arenas: Int64Array) -> Scene:
+        """Of these arenas [...], a copy: its arrays are [..., K, 3] and so on."""
+        return Scene(self._physics.robots[arenas], self._targets[arenas], self._obstacles[arenas])
 
     def _outcomes(self, arenas: Int64Array, success: BoolArray) -> tuple[Outcome | None, ...]:
         failed = self.collisions[arenas] >= self._max_collisions
@@ -130,16 +135,18 @@ class ArenaBatch:
         return training_start(self._config, layout_for(self._config, rng), rng)
 
     def _place(self, arena: int, start: Start) -> None:
-        num_robots, num_targets = self._config.num_robots, self._config.target_count
-        if start.robots.shape != (num_robots, 3) or start.targets.shape != (num_targets, 2):
+        config = self._config
+        shapes = (start.robots.shape, start.targets.shape, start.obstacles.shape)
+        right = (config.num_robots, 3), (config.target_count, 2), (config.obstacle_count, 3)
+        if shapes != right:
             raise ValueError(
-                f"start has robots {start.robots.shape} and targets {start.targets.shape}; "
-                f"this arena has {num_robots} and {num_targets}"
+                f"start has robots, targets and obstacles {shapes}; this arena has {right}"
             )
         if not np.isfinite(start.targets).all():
             raise ValueError(f"start has targets {start.targets.tolist()}")
-        self._physics.place(arena, start.robots)
+        self._physics.place(arena, start.robots, start.obstacles)
         self._targets[arena] = start.targets
+        self._obstacles[arena] = start.obstacles
 
 
 def make_arenas(

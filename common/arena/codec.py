@@ -35,13 +35,14 @@ class SceneCodec:
     """A record is the scene as its robot lists it; the picture is drawn when it is needed.
 
     float32, little-endian: own x, y, heading; x, y, heading of the other robots in their order;
-    x, y of the targets.
+    x, y of the targets; x, y, radius of the obstacles.
     """
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
         num = config.num_robots
-        self._num_numbers = 3 * num + 2 * config.target_count
+        self._ends = (3 * num, 3 * num + 2 * config.target_count)  # of the robots, of the targets
+        self._num_numbers = self._ends[1] + 3 * config.obstacle_count
         self.record_bytes = _NUMBER.itemsize * self._num_numbers
         self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
         self._views = AnalyticViews(config) if config.renderer == "analytic" else None
@@ -54,8 +55,10 @@ class SceneCodec:
         leading = scene.robots.shape[:-2]
         numbers = np.empty((*leading, num, self._num_numbers), _NUMBER)
         numbers[..., : 3 * num] = scene.robots[..., self._order, :].reshape(*leading, num, 3 * num)
-        targets_shape = (*leading, 1, self._num_numbers - 3 * num)
-        numbers[..., 3 * num :] = scene.targets.reshape(targets_shape)
+        start, end = self._ends
+        numbers[..., start:end] = scene.targets.reshape(*leading, 1, end - start)
+        rest = self._num_numbers - end
+        numbers[..., end:] = scene.obstacles.reshape(*leading, 1, rest)
         return numbers.view(np.uint8)
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
@@ -71,8 +74,8 @@ class SceneCodec:
         return pictures
 
     def _scene_of(self, numbers: Float32Array) -> Scene:
-        robots, targets = np.split(numbers.astype(np.float64), [3 * len(self._order)])
-        return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2))
+        robots, targets, obstacles = np.split(numbers.astype(np.float64), self._ends)
+        return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2), obstacles.reshape(-1, 3))
 
 
 class FrameCodec:

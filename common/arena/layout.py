@@ -1,7 +1,7 @@
-"""Where the targets stand, and which symmetries of the square leave them where they are.
+"""Where the targets stand, and which symmetries of the square leave the layout as it is.
 
-Invariants: every layout that leaves here can be solved: each target is near enough to a place a
-robot can reach, and no two are so near that two robots cannot stand on them together.
+Invariants: in every layout that leaves here each target is near enough to a place where a robot
+can be, and no two are so near that two robots cannot stand on them together.
 """
 
 from functools import cache
@@ -9,6 +9,16 @@ from itertools import product
 
 import numpy as np
 
+from common.arena.obstacles import (
+    STANDING_PX,
+    given_obstacles,
+    inner_walls,
+    obstacles_for,
+    reachable_px,
+    room_px,
+    scattered,
+)
+from common.arena.scene import Layout
 from common.arena.symmetry import IDENTITY, Symmetry
 from common.config import ArenaConfig
 from common.errors import ConfigError
@@ -16,9 +26,6 @@ from common.trajectory import Float64Array
 
 _LAYOUT_SIZE_PX = 600
 _TRIES = 2000  # of all targets at once
-_CANDIDATES = 64  # places drawn at once for one target
-_RESTARTS = 200  # of targets drawn one after the other
-_WALL_MARGIN_PX = 5.0
 
 _FIXED: dict[int, tuple[tuple[float, float], ...]] = {
     1: ((300, 300),),
@@ -51,18 +58,20 @@ def fixed_layout(num_targets: int) -> Float64Array:
     return np.array(_FIXED[num_targets], np.float64)
 
 
-def layout_for(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
-    """Target centres [M, 2] px for the next episode: the fixed ones, or drawn with rng.
+def layout_for(config: ArenaConfig, rng: np.random.Generator) -> Layout:
+    """Targets and obstacles of the next episode: the fixed ones, or drawn with rng.
 
     Raises ConfigError when no such layout fits, naming what does not.
     """
     if config.target_layout == "random":
-        return _random_layout(config, rng)
-    return _given_layout(config).copy()
+        obstacles = obstacles_for(config, np.empty((0, 2)), rng)
+        return Layout(_random_targets(config, obstacles, rng), obstacles)
+    targets = _given_targets(config)
+    return Layout(targets.copy(), obstacles_for(config, targets, rng))
 
 
 @cache
-def _given_layout(config: ArenaConfig) -> Float64Array:
+def _given_targets(config: ArenaConfig) -> Float64Array:
     if config.targets_px:
         targets = np.array(config.targets_px, np.float64)
     else:
@@ -74,77 +83,44 @@ def _given_layout(config: ArenaConfig) -> Float64Array:
 def layout_symmetries(config: ArenaConfig) -> tuple[Symmetry, ...]:
     """The symmetries of the square under which an agent's experience stays true.
 
-    Unrotated pictures: those that map the target layout onto itself, all 8 if targets are
-    random. Heading-up pictures: a rotation of the arena changes nothing in them, a reflection
-    mirrors them left to right; so the identity, and the mirror if a reflection maps the layout
-    onto itself.
+    Unrotated pictures: those that map onto itself whatever is not random: targets, obstacles and
+    inner walls; all 8 if nothing is fixed. Heading-up pictures: a rotation of the arena changes
+    nothing in them, a reflection mirrors them left to right; so the identity, and the mirror if a
+    reflection maps the layout onto itself.
     """
-    every = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3))
-    if config.target_layout == "random":
-        kept = every
-    else:
-        targets = layout_for(config, np.random.default_rng(0))
-        kept = tuple(s for s in every if _maps_onto_itself(s, targets, config.size_px))
+    every = (Symmetry(*flags) for flags in product((False, True), repeat=3))
+    kept = tuple(symmetry for symmetry in every if _maps_onto_itself(symmetry, config))
     if config.orientation == "unrotated":
         return kept
     mirror = Symmetry(transpose=False, flip_x=True, flip_y=False)
     return (IDENTITY, mirror) if any(s.mirrors for s in kept) else (IDENTITY,)
 
 
-def reachable_px(config: ArenaConfig) -> tuple[float, float]:
-    """Least and greatest coordinate at which a robot's centre can be."""
-    low = config.wall_offset_px + config.wall_thickness_px + config.robot_radius_px
-    return low, config.size_px - low
-
-
-def wall_segments(config: ArenaConfig) -> Float64Array:
-    """The walls as lines with a width [4, 5]: x, y of both ends, half the width, px.
-
-    From the inner face outwards they are two steps wide, so that no step leads over one.
-    """
-    half = config.step_px
-    inner = config.wall_offset_px + config.wall_thickness_px
-    low, high = inner - half, config.size_px - inner + half
-    corners = [(low, low), (high, low), (high, high), (low, high)]
-    lines = zip(corners, corners[1:] + corners[:1], strict=True)
-    return np.array([(*start, *end, half) for start, end in lines])
-
-
-def _random_layout(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
+def _random_targets(
+    config: ArenaConfig, obstacles: Float64Array, rng: np.random.Generator
+) -> Float64Array:
     low, high = reachable_px(config)
-    low, high = low + _WALL_MARGIN_PX, high - _WALL_MARGIN_PX
+    low, high = low + STANDING_PX, high - STANDING_PX
     apart = 2 * config.robot_radius_px + 2 * config.success_radius_px
-    if config.target_count == config.num_robots:
+    if config.target_count > config.num_robots or len(obstacles) or config.inner_walls_px:
+        targets = scattered(
+            config.target_count,
+            (low, high),
+            apart,
+            lambda places: room_px(config, places, obstacles) >= STANDING_PX,
+            rng,
+        )
+        if targets is not None:
+            return targets
+    else:  # as ever, so that a seed's episodes stay what they were
         for _ in range(_TRIES if high >= low else 0):
             targets = rng.uniform(low, high, (config.num_robots, 2))
             if _nearest_pair_px(targets) >= apart:
                 return targets
-    else:
-        scattered = _scattered(config.target_count, low, high, apart, rng)
-        if scattered is not None:
-            return scattered
     raise ConfigError(
         f"{config.target_count} random targets {apart:g} px apart do not fit in an arena of "
-        f"{config.size_px} px; fewer targets or a larger arena"
+        f"{config.size_px} px; fewer targets or obstacles, or a larger arena"
     )
-
-
-def _scattered(
-    num: int, low: float, high: float, apart: float, rng: np.random.Generator
-) -> Float64Array | None:
-    """Places [num, 2] drawn one after the other, each `apart` from all before; None: no room."""
-    for _ in range(_RESTARTS if high >= low else 0):
-        places = np.empty((0, 2))
-        while len(places) < num:
-            candidates = rng.uniform(low, high, (_CANDIDATES, 2))
-            gaps = np.hypot(*(candidates[:, None] - places[None]).transpose(2, 0, 1))
-            free = (gaps >= apart).all(axis=1)
-            if not free.any():
-                break
-            places = np.concatenate([places, candidates[None, free.argmax()]])
-        else:
-            return places
-    return None
 
 
 def _check_solvable(config: ArenaConfig, targets: Float64Array) -> None:
@@ -155,6 +131,13 @@ def _check_solvable(config: ArenaConfig, targets: Float64Array) -> None:
         raise ConfigError(
             f"target ({x:g}, {y:g}) cannot be reached: robots' centres stay between {low:g} and "
             f"{high:g} px, success needs {config.success_radius_px:g} px"
+        )
+    room = room_px(config, targets, given_obstacles(config))
+    if (room < 0).any():
+        x, y = targets[int(room.argmin())]
+        raise ConfigError(
+            f"target ({x:g}, {y:g}) cannot be reached: a robot on it would overlap an obstacle or "
+            "an inner wall; move the one or the other"
         )
     nearest = _nearest_pair_px(targets)
     if nearest + 2 * config.success_radius_px <= 2 * config.robot_radius_px:
@@ -171,7 +154,30 @@ def _nearest_pair_px(targets: Float64Array) -> float:
     return float(np.hypot(*(targets[first] - targets[second]).T).min())
 
 
-def _maps_onto_itself(symmetry: Symmetry, targets: Float64Array, size_px: float) -> bool:
-    image = symmetry.apply_to_points(targets, size_px)
-    gaps = np.abs(image[:, None] - targets[None]).max(axis=2)
-    return bool((gaps.min(axis=1) < 1e-6).all())
+def _maps_onto_itself(symmetry: Symmetry, config: ArenaConfig) -> bool:
+    """Whether all that is not random stays where it is."""
+
+    def mapped(points: Float64Array) -> Float64Array:
+        return symmetry.apply_to_points(points, config.size_px)
+
+    obstacles, walls = given_obstacles(config), inner_walls(config)
+    ends, others = mapped(walls[:, :2]), mapped(walls[:, 2:4])
+    fixed = [
+        (obstacles, np.concatenate([mapped(obstacles[:, :2]), obstacles[:, 2:]], axis=1)),
+        (_both_ways(walls[:, :2], walls[:, 2:4]), _both_ways(ends, others)),
+    ]
+    if config.target_layout == "fixed":
+        targets = _given_targets(config)
+        fixed.append((targets, mapped(targets)))
+    return all(_same_rows(rows, images) for rows, images in fixed)
+
+
+def _both_ways(ends: Float64Array, others: Float64Array) -> Float64Array:
+    """Lines [2 S, 4], each from either end."""
+    there, back = np.concatenate([ends, others], 1), np.concatenate([others, ends], 1)
+    return np.concatenate([there, back])
+
+
+def _same_rows(rows: Float64Array, images: Float64Array) -> bool:
+    gaps = np.abs(images[:, None] - rows[None]).max(axis=2)
+    return bool((gaps.min(axis=1, initial=np.inf) < 1e-6).all())

@@ -1,13 +1,13 @@
 """Moves the robots of many arenas and finds their collisions, compiled.
 
 Each robot turns, then proposes its way of step_px. Two proposals that overlap undo each other, one
-beyond a wall is undone (the turn stays); a proposal that overlaps a robot so restored is undone
-too, until none does. All whose way was undone have collided. With back_off_frames, a robot that
-collided is driven straight backwards for that many frames, whatever its action; it may be blocked
-again meanwhile, which neither counts as its collision nor prolongs it.
+into a wall or an obstacle is undone (the turn stays); a proposal that overlaps a robot so restored
+is undone too, until none does. All whose way was undone have collided. With back_off_frames, a
+robot that collided is driven straight backwards for that many frames, whatever its action; it may
+be blocked again meanwhile, which neither counts as its collision nor prolongs it.
 
-Invariants: after every move no two robots' centres are nearer than two radii and no centre is
-nearer than a radius to a wall's inner face (touching is allowed); the outcome does not depend on
+Invariants: after every move no two robots' centres are nearer than two radii and no robot overlaps
+a wall or an obstacle (touching is allowed); the outcome does not depend on
 the robots' order. Numbers are computed as pymunk does, so that both give the same bits
 (common.arena.pymunk_physics).
 """
@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
-from common.arena.layout import reachable_px, wall_segments
+from common.arena.obstacles import inner_walls, outer_walls, reachable_px
 from common.arena.scene import STRAIGHT
 from common.config import ArenaConfig
 from common.trajectory import BoolArray, Float64Array, Int64Array, UInt8Array
@@ -32,17 +32,17 @@ class Physics(Protocol):
         """Poses [A, K, 3]; to be read only."""
         ...
 
-    def place(self, arena: int, robots: Float64Array) -> None:
+    def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
         """Puts an arena's robots at the poses [K, 3] and forgets their collisions.
 
-        Raises ValueError when one overlaps another or a wall.
+        obstacles: discs [O, 3] that stay. Raises ValueError when a robot overlaps anything.
         """
         ...
 
     def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
         """Turns and moves every robot of the arenas [N] at once; actions: [N, K].
 
-        Returns who collided [N, K] and, of those, whose way led beyond a wall [N, K].
+        Returns who collided [N, K] and, of those, whose way led into a wall or obstacle [N, K].
         """
         ...
 
@@ -52,7 +52,8 @@ class ArrayPhysics:
 
     def __init__(self, config: ArenaConfig, num_arenas: int) -> None:
         self._config = config
-        self._walls = wall_segments(config)
+        self._walls = np.concatenate([outer_walls(config), inner_walls(config)])
+        self._obstacles = np.zeros((num_arenas, config.obstacle_count, 3))
         self._robots = np.zeros((num_arenas, config.num_robots, 3))
         self._back_off = np.zeros((num_arenas, config.num_robots), np.int64)
 
@@ -60,9 +61,10 @@ class ArrayPhysics:
     def robots(self) -> Float64Array:
         return self._robots
 
-    def place(self, arena: int, robots: Float64Array) -> None:
-        check_placed(self._config, robots)
+    def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
+        check_placed(self._config, robots, obstacles)
         self._robots[arena] = robots
+        self._obstacles[arena] = obstacles
         self._back_off[arena] = 0
 
     def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
@@ -75,6 +77,7 @@ class ArrayPhysics:
             self._robots,
             self._back_off,
             self._walls,
+            self._obstacles,
             math.radians(config.turn_deg),
             config.step_px,
             config.robot_radius_px,
@@ -85,24 +88,28 @@ class ArrayPhysics:
         return collided, hit_wall
 
 
-def check_placed(config: ArenaConfig, robots: Float64Array) -> None:
-    """Raises ValueError when a robot at the poses [K, 3] overlaps another or a wall."""
-    i, inside = _first_misplaced(robots, *reachable_px(config), config.robot_radius_px)
-    if i < len(robots):
-        what = "overlaps another" if inside else "is not between the walls"
-        raise ValueError(f"robot {i} at {tuple(robots[i].tolist())} {what}")
+def check_placed(config: ArenaConfig, robots: Float64Array, obstacles: Float64Array) -> None:
+    """Raises ValueError when a robot at the poses [K, 3] overlaps anything."""
+    bounds, radius = reachable_px(config), config.robot_radius_px
+    i, problem = _first_misplaced(robots, bounds, radius, inner_walls(config), obstacles)
+    if problem:
+        what = ("is not between the walls", "overlaps an obstacle or wall", "overlaps another")
+        raise ValueError(f"robot {i} at {tuple(robots[i].tolist())} {what[problem - 1]}")
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _first_misplaced(robots, low, high, radius):  # type: ignore[no-untyped-def]
-    """The first robot that cannot be where it is, and whether it is between the walls; else K."""
+def _first_misplaced(robots, bounds, radius, walls, obstacles):  # type: ignore[no-untyped-def]
+    """The first robot that cannot be where it is, and why: 1 bounds, 2 what stays, 3 a robot."""
+    low, high = bounds
     for i in range(len(robots)):
         x, y, heading = robots[i]
         if not (low <= x <= high and low <= y <= high and math.isfinite(heading)):
-            return i, False
+            return i, 1
+        if _meets_fixed(x, y, radius, walls, obstacles):
+            return i, 2
         if _meets_robot(i, robots, radius):
-            return i, True
-    return len(robots), True
+            return i, 3
+    return 0, 0
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -112,6 +119,7 @@ def _move_all(  # type: ignore[no-untyped-def]
     robots,
     back_off,
     walls,
+    obstacles,
     turn_rad,
     step_px,
     radius,
@@ -132,7 +140,9 @@ def _move_all(  # type: ignore[no-untyped-def]
             way = -step_px if backs[i] > 0 else step_px
             places[i, 0] = poses[i, 0] + way * math.cos(poses[i, 2])
             places[i, 1] = poses[i, 1] + way * math.sin(poses[i, 2])
-            beyond[i] = _meets_wall(places[i, 0], places[i, 1], radius, walls)
+            beyond[i] = _meets_fixed(
+                places[i, 0], places[i, 1], radius, walls, obstacles[arenas[n]]
+            )
         _block(poses, places, radius, beyond, blocked, hits)
         for i in range(num_robots):
             poses[i, 0], poses[i, 1] = places[i, 0], places[i, 1]
@@ -170,14 +180,20 @@ def _meets_robot(i, places, radius):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _meets_wall(x, y, radius, walls):  # type: ignore[no-untyped-def]
-    """Whether the disc is nearer to a segment's line than the radius and the line's half width."""
+def _meets_fixed(x, y, radius, walls, obstacles):  # type: ignore[no-untyped-def]
+    """Whether the disc overlaps an obstacle, or a wall: its nearest point is too near."""
+    for n in range(len(obstacles)):
+        across, along = obstacles[n, 0] - x, obstacles[n, 1] - y
+        reach = radius + obstacles[n, 2]
+        if across * across + along * along < reach * reach:
+            return True
     for ax, ay, bx, by, half in walls:
         dx, dy = bx - ax, by - ay
         t = (dx * (x - ax) + dy * (y - ay)) / (dx * dx + dy * dy)
         t = max(0.0, min(t, 1.0))
         across, along = ax + dx * t - x, ay + dy * t - y
-        if across * across + along * along < (radius + half) * (radius + half):
+        reach = radius + half
+        if across * across + along * along < reach * reach:
             return True
     return False
 

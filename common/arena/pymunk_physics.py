@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pymunk
 
-from common.arena.layout import wall_segments
+from common.arena.obstacles import inner_walls, outer_walls
 from common.arena.physics import check_placed
 from common.arena.scene import STRAIGHT
 from common.config import ArenaConfig
@@ -27,8 +27,8 @@ class PymunkPhysics:
     def robots(self) -> Float64Array:
         return np.stack([world.robots for world in self._worlds])
 
-    def place(self, arena: int, robots: Float64Array) -> None:
-        self._worlds[arena].place(robots)
+    def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
+        self._worlds[arena].place(robots, obstacles)
 
     def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
         collided = np.empty(actions.shape, np.bool_)
@@ -46,8 +46,10 @@ class World:
         self._turn_rad = math.radians(config.turn_deg)
         num_robots = config.num_robots
         self._space = pymunk.Space()
-        for ax, ay, bx, by, half in wall_segments(config).tolist():
-            self._space.add(pymunk.Segment(self._space.static_body, (ax, ay), (bx, by), half))
+        self._still = self._space.static_body
+        for ax, ay, bx, by, half in (*outer_walls(config), *inner_walls(config)):
+            self._space.add(pymunk.Segment(self._still, (ax, ay), (bx, by), half))
+        self._obstacles: list[pymunk.Circle] = []
         self._bodies = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in range(num_robots)]
         self._shapes = [pymunk.Circle(body, config.robot_radius_px) for body in self._bodies]
         self._space.add(*self._bodies, *self._shapes)
@@ -59,19 +61,22 @@ class World:
         """Poses [K, 3], a copy."""
         return np.array(self._poses, np.float64)
 
-    def place(self, robots: Float64Array) -> None:
+    def place(self, robots: Float64Array, obstacles: Float64Array) -> None:
         """As Physics.place, of this arena."""
-        check_placed(self._config, robots)
+        check_placed(self._config, robots, obstacles)
+        self._space.remove(*self._obstacles)
+        self._obstacles = [pymunk.Circle(self._still, r, (x, y)) for x, y, r in obstacles.tolist()]
+        self._space.add(*self._obstacles)
         self._poses = [(x, y, heading) for x, y, heading in robots.tolist()]
         self._back_off = [0] * len(self._poses)
 
     def move(self, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
-        """As Physics.move, of this arena: who collided [K], and whose way led beyond a wall."""
+        """As Physics.move, of this arena: who collided [K], and whose way led into what stays."""
         turned = [self._turn(i, action) for i, action in enumerate(actions.tolist())]
         proposals = [self._advance(i, pose) for i, pose in enumerate(turned)]
         for i, proposal in enumerate(proposals):
             self._put(i, proposal)
-        beyond = {i for i in range(len(proposals)) if self._meets_wall(i)}
+        beyond = {i for i in range(len(proposals)) if self._meets_fixed(i)}
         waiting = set(range(len(proposals)))
         blocked: set[int] = set()
         while hits := {i for i in waiting if self._space.shape_query(self._shapes[i])}:
@@ -104,10 +109,9 @@ class World:
         way = -self._config.step_px if self._back_off[i] else self._config.step_px
         return x + way * math.cos(heading), y + way * math.sin(heading), heading
 
-    def _meets_wall(self, i: int) -> bool:
-        still = self._space.static_body
+    def _meets_fixed(self, i: int) -> bool:
         met = self._space.shape_query(self._shapes[i])
-        return any(info.shape is not None and info.shape.body is still for info in met)
+        return any(info.shape is not None and info.shape.body is self._still for info in met)
 
     def _put(self, i: int, pose: Pose) -> None:
         body = self._bodies[i]

@@ -10,15 +10,18 @@ import math
 import cv2
 import numpy as np
 
+from common.arena.obstacles import inner_walls
 from common.arena.scene import Scene
 from common.arena.views import HEADING_WIDTH_PX
 from common.config import ArenaConfig
-from common.trajectory import UInt8Array
+from common.trajectory import Float64Array, UInt8Array
 
 BLACK = (0, 0, 0)
 WHITE = (255, 255, 255)
 RED = (0, 0, 255)
+GREEN = (0, 255, 0)
 BLUE = (255, 0, 0)
+Colour = tuple[int, int, int]  # blue, green, red
 _SHIFT = 8  # fractional bits of OpenCV's coordinates
 
 
@@ -33,6 +36,10 @@ def draw_arena(
     inner = outer + config.wall_thickness_px
     _fill(picture, outer * scale, size - outer * scale, RED)
     _fill(picture, inner * scale, size - inner * scale, BLACK)
+    for wall in inner_walls(config):
+        _draw_wall(picture, wall * scale, line_type)
+    for x, y, radius in (scene.obstacles * scale).tolist():
+        _draw_disc(picture, x, y, radius, GREEN, line_type)
     half = config.target_size_px / 2
     for x, y in scene.targets.tolist():
         corners = np.array([[x - half, y - half], [x + half, y + half]]) * scale
@@ -40,8 +47,7 @@ def draw_arena(
         picture[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = BLUE
     radius = config.robot_radius_px * scale
     for x, y, _ in scene.robots.tolist():
-        at = _fixed(x * scale, y * scale)
-        cv2.circle(picture, at, round((radius - 0.5) * 2**_SHIFT), WHITE, -1, line_type, _SHIFT)
+        _draw_disc(picture, x * scale, y * scale, radius, WHITE, line_type)
     width = max(1, round(HEADING_WIDTH_PX * scale))
     for x, y, heading in scene.robots.tolist():
         rim = (x * scale + radius * math.cos(heading), y * scale + radius * math.sin(heading))
@@ -94,8 +100,26 @@ def _turned_window(
     return np.asarray(cv2.warpAffine(grey, turn, (width, width)), np.uint8)
 
 
-def _fill(picture: UInt8Array, low: float, high: float, colour: tuple[int, int, int]) -> None:
+def _fill(picture: UInt8Array, low: float, high: float, colour: Colour) -> None:
     picture[round(low) : round(high), round(low) : round(high)] = colour
+
+
+def _draw_disc(
+    picture: UInt8Array, x: float, y: float, radius: float, colour: Colour, line_type: int
+) -> None:
+    rim = round(max(radius - 0.5, 0) * 2**_SHIFT)
+    cv2.circle(picture, _fixed(x, y), rim, colour, -1, line_type, _SHIFT)
+
+
+def _draw_wall(picture: UInt8Array, wall: Float64Array, line_type: int) -> None:
+    """The rectangle of a line with a width [5], half a pixel smaller on all sides."""
+    ends, half = wall[:4].reshape(2, 2), max(wall[4] - 0.5, 0)
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    across = half * np.array([-along[1], along[0]])
+    start, end = ends[0] + 0.5 * along, ends[1] - 0.5 * along
+    corners = [start - across, start + across, end + across, end - across]
+    points = np.array([_fixed(x, y) for x, y in corners])
+    cv2.fillConvexPoly(picture, points, RED, line_type, _SHIFT)
 
 
 def _fixed(x: float, y: float) -> tuple[int, int]:

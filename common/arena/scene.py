@@ -5,7 +5,9 @@ images, pixel i covering [i, i + 1); a heading of 0 looks along +x and grows clo
 viewer, because y points down.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from common.trajectory import Float64Array
 
@@ -17,12 +19,25 @@ RIGHT = 2
 """Heading increases by `turn_deg`: clockwise to the viewer. Then the robot moves on."""
 
 
+def _none() -> Float64Array:
+    return np.empty((0, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What stays where it is for an episode: M targets and O obstacles."""
+
+    targets: Float64Array  # [M, 2], x px, y px
+    obstacles: Float64Array = field(default_factory=_none)  # [O, 3], x px, y px, radius px
+
+
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Poses of K robots and places of M targets."""
+    """Poses of K robots, places of M targets, and O obstacles."""
 
     robots: Float64Array  # [K, 3], x px, y px, heading rad
     targets: Float64Array  # [M, 2], x px, y px
+    obstacles: Float64Array = field(default_factory=_none)  # [O, 3], x px, y px, radius px
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,3 +46,4 @@ class Start:
 
     robots: Float64Array  # [K, 3], x px, y px, heading rad
     targets: Float64Array  # [M, 2], x px, y px
+    obstacles: Float64Array = field(default_factory=_none)  # [O, 3], x px, y px, radius px

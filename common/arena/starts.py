@@ -8,8 +8,9 @@ import math
 
 import numpy as np
 
-from common.arena.layout import layout_for, reachable_px
-from common.arena.scene import Start
+from common.arena.layout import layout_for
+from common.arena.obstacles import reachable_px, room_px
+from common.arena.scene import Layout, Start
 from common.config import ArenaConfig
 from common.errors import ConfigError
 from common.trajectory import BoolArray, Float64Array
@@ -18,12 +19,13 @@ _CANDIDATES = 32  # poses drawn at once for one robot
 _RESTARTS = 200  # of a placement that got stuck
 
 
-def training_start(config: ArenaConfig, targets: Float64Array, rng: np.random.Generator) -> Start:
-    """A start with random poses; targets: [M, 2] px.
+def training_start(config: ArenaConfig, layout: Layout, rng: np.random.Generator) -> Start:
+    """A start with random poses in the layout.
 
     Raises ConfigError when the robots do not fit.
     """
-    return Start(_place(config, rng, num_turns=0), targets)
+    poses = _place(config, layout.obstacles, rng, num_turns=0)
+    return Start(poses, layout.targets, layout.obstacles)
 
 
 def test_starts(config: ArenaConfig, num: int, seed: int) -> tuple[Start, ...]:
@@ -36,12 +38,15 @@ def test_starts(config: ArenaConfig, num: int, seed: int) -> tuple[Start, ...]:
     num_turns = math.ceil(360 / config.turn_deg)
     starts = []
     for _ in range(num):
-        targets = layout_for(config, rng)
-        starts.append(Start(_place(config, rng, num_turns), targets))
+        layout = layout_for(config, rng)
+        poses = _place(config, layout.obstacles, rng, num_turns)
+        starts.append(Start(poses, layout.targets, layout.obstacles))
     return tuple(starts)
 
 
-def _place(config: ArenaConfig, rng: np.random.Generator, num_turns: int) -> Float64Array:
+def _place(
+    config: ArenaConfig, obstacles: Float64Array, rng: np.random.Generator, num_turns: int
+) -> Float64Array:
     """Poses [K, 3] that stay clear while all robots turn left for num_turns frames."""
     for _ in range(_RESTARTS):
         poses = np.empty((config.num_robots, 3))
@@ -49,7 +54,7 @@ def _place(config: ArenaConfig, rng: np.random.Generator, num_turns: int) -> Flo
         for i in range(config.num_robots):
             candidates = _random_poses(config, rng)
             ways = _circle_paths(config, candidates, num_turns)
-            clear = _clear(config, ways, paths[:i])
+            clear = _clear(config, ways, paths[:i], obstacles)
             if not clear.any():
                 break
             chosen = int(clear.argmax())
@@ -58,7 +63,7 @@ def _place(config: ArenaConfig, rng: np.random.Generator, num_turns: int) -> Flo
             return poses
     raise ConfigError(
         f"{config.num_robots} robots of radius {config.robot_radius_px:g} px do not fit in an "
-        f"arena of {config.size_px} px; fewer robots or a larger arena"
+        f"arena of {config.size_px} px; fewer robots or obstacles, or a larger arena"
     )
 
 
@@ -81,10 +86,14 @@ def _circle_paths(config: ArenaConfig, poses: Float64Array, num_turns: int) -> F
     return np.concatenate([start, start + steps.cumsum(axis=1)], axis=1)
 
 
-def _clear(config: ArenaConfig, ways: Float64Array, placed: Float64Array) -> BoolArray:
-    """Which ways [C, T, 2] keep off the walls and off the placed ways [P, T, 2]; [C]."""
+def _clear(
+    config: ArenaConfig, ways: Float64Array, placed: Float64Array, obstacles: Float64Array
+) -> BoolArray:
+    """Which ways [C, T, 2] keep off walls, obstacles and the placed ways [P, T, 2]; [C]."""
     low, high = reachable_px(config)
     inside = ((ways >= low) & (ways <= high)).all(axis=(1, 2))
+    if len(obstacles) or config.inner_walls_px:
+        inside &= (room_px(config, ways, obstacles) >= 0).all(axis=1)
     gaps = ways[:, None] - placed[None]
     apart = (gaps * gaps).sum(axis=3) >= (2 * config.robot_radius_px) ** 2
     clear: BoolArray = np.logical_and(inside, apart.all(axis=(1, 2)))

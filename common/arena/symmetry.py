@@ -59,7 +59,9 @@ class Symmetry:
             headings = -headings
         places = self.apply_to_points(scene.robots[:, :2], size_px)
         robots = np.concatenate([places, headings[:, None]], axis=1)
-        return Scene(robots, self.apply_to_points(scene.targets, size_px))
+        centres = self.apply_to_points(scene.obstacles[:, :2], size_px)
+        obstacles = np.concatenate([centres, scene.obstacles[:, 2:]], axis=1)
+        return Scene(robots, self.apply_to_points(scene.targets, size_px), obstacles)
 
 
 IDENTITY = Symmetry(transpose=False, flip_x=False, flip_y=False)

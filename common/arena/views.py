@@ -1,9 +1,9 @@
 """Draws every robot's picture straight from poses: the area each shape covers of each pixel.
 
 Invariants: a picture pixel is the mean over its square of crop_px / view_px arena pixels; the
-window is centred exactly on the robot; shapes are painted over one another in the order wall,
-targets, robots, headings on a black floor, and black lies outside the arena. Coordinates are
-continuous (pixel i covers [i, i + 1)), so a mapped scene gives the mapped picture. Records of
+window is centred exactly on the robot; shapes are painted over one another in the order walls,
+obstacles, targets, robots, headings on a black floor, and black lies outside the arena. Coordinates
+are continuous (pixel i covers [i, i + 1)), so a mapped scene gives the mapped picture. Records of
 any bytes give some picture: what is not finite is not drawn.
 """
 
@@ -12,10 +12,12 @@ import math
 import numpy as np
 from numba import njit
 
+from common.arena.obstacles import inner_walls
 from common.config import ArenaConfig
 from common.trajectory import Float32Array, UInt8Array
 
 WALL_GREY = 76  # red, green, blue and white by OpenCV's weights
+OBSTACLE_GREY = 150
 TARGET_GREY = 29
 ROBOT_GREY = 255
 HEADING_GREY = 0
@@ -29,7 +31,8 @@ class AnalyticViews:
     """The renderer of one configuration."""
 
     def __init__(self, config: ArenaConfig) -> None:
-        self._num_robots = config.num_robots
+        self._counts = (config.num_robots, config.target_count, config.obstacle_count)
+        self._inner_walls = inner_walls(config)
         self._heading_up = config.orientation == "heading_up"
         scale = config.view_px / config.crop_px
         outer = config.wall_offset_px
@@ -39,14 +42,15 @@ class AnalyticViews:
         self._radius = config.robot_radius_px * scale
 
     def draw(self, scenes: Float32Array, out: UInt8Array) -> None:
-        """Fills out [N, V, V] from scenes [N, 3 K + 2 M]: own pose, other robots', targets."""
+        """Fills out [N, V, V] from scenes [N, 3 K + 2 M + 3 O] of SceneCodec."""
         _draw_views(
             scenes,
             out,
-            self._num_robots,
+            self._counts,
             self._heading_up,
             self._scale,
             self._wall,
+            self._inner_walls,
             self._target_half,
             self._radius,
         )
@@ -54,8 +58,10 @@ class AnalyticViews:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _draw_views(  # type: ignore[no-untyped-def]
-    scenes, out, num_robots, heading_up, scale, wall, target_half, radius
+    scenes, out, counts, heading_up, scale, wall, inner_walls, target_half, radius
 ):
+    num_robots, num_targets, num_obstacles = counts
+    targets, obstacles = 3 * num_robots, 3 * num_robots + 2 * num_targets
     size = out.shape[1]
     cover = np.zeros(size + 1, np.float64)
     hand_width = 0.5 * HEADING_WIDTH_PX * scale
@@ -73,7 +79,16 @@ def _draw_views(  # type: ignore[no-untyped-def]
             _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall)
         else:
             _walls_upright(view, own_x, own_y, scale, wall)
-        for j in range(3 * num_robots, len(scene), 2):
+        for ax, ay, bx, by, half in inner_walls:
+            length = math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
+            dx, dy = (bx - ax) / length, (by - ay) / length
+            x, y = _map(ax - own_x, ay - own_y, c, s, scale, size)
+            across, along = c * dx - s * dy, s * dx + c * dy
+            _bar(view, cover, x, y, across, along, 0.0, length * scale, half * scale, WALL_GREY)
+        for j in range(obstacles, obstacles + 3 * num_obstacles, 3):
+            x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
+            _disc(view, cover, x, y, np.float64(scene[j + 2]) * scale, OBSTACLE_GREY)
+        for j in range(targets, obstacles, 2):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
             if heading_up:
                 _bar(view, cover, x, y, c, s, -target_half, target_half, target_half, TARGET_GREY)
@@ -88,7 +103,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
                 )
         for j in range(0, 3 * num_robots, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
-            _disc(view, cover, x, y, radius)
+            _disc(view, cover, x, y, radius, ROBOT_GREY)
         for j in range(0, 3 * num_robots, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
             if -radius < x < size + radius and -radius < y < size + radius:
@@ -170,8 +185,8 @@ def _add_span(cover, low, high, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _disc(view, cover, x, y, radius):  # type: ignore[no-untyped-def]
-    """Paints a robot's disc: exact along x, sampled by scan lines along y."""
+def _disc(view, cover, x, y, radius, grey):  # type: ignore[no-untyped-def]
+    """Paints a disc: exact along x, sampled by scan lines along y."""
     size = view.shape[0]
     if not (x + radius > 0 and x - radius < size and y + radius > 0 and y - radius < size):
         return
@@ -188,7 +203,7 @@ def _disc(view, cover, x, y, radius):  # type: ignore[no-untyped-def]
                 if low < high:
                     _add_span(cover, low, high, _WEIGHTS[k] * tall)
         for j in range(first, last):
-            view[i, j] = _blend(view[i, j], ROBOT_GREY, min(cover[j], 1.0))
+            view[i, j] = _blend(view[i, j], grey, min(cover[j], 1.0))
             cover[j] = 0.0
         cover[size] = 0.0
 

@@ -52,7 +52,8 @@ class Path2D:
     """One episode's paths, as `trajectories` draws them."""
 
     robots: Float64Array  # [T, K, 3], x_px, y_px, heading_rad
-    targets: Float64Array  # [K, 2], centres in px
+    targets: Float64Array  # [M, 2], centres in px
+    obstacles: Float64Array  # [O, 3], centres and radius in px
     outcome: Outcome
 
 
@@ -207,7 +208,7 @@ def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> 
     """A grid of episodes as a picture at `out` (paper Fig. 8).
 
     Each robot's path is shaded from light (start) to dark (end) in its own hue; red circles:
-    starts; blue squares: targets; red lines: the wall.
+    starts; blue squares: targets; red lines: walls; green discs: obstacles.
     """
     columns = min(4, max(1, len(episodes)))
     rows = max(1, -(-len(episodes) // columns))
@@ -230,7 +231,7 @@ def save(figure: Figure, out: Path) -> None:
 
 
 def draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
-    _draw_arena(axes, episode.targets, config)
+    _draw_arena(axes, episode, config)
     radius = config.robot_radius_px
     for k in range(episode.robots.shape[1]):
         path = episode.robots[:, k, :2]
@@ -248,13 +249,17 @@ def draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
     axes.set_title(f"{episode.outcome.value}, {len(episode.robots) - 1} frames", fontsize=9)
 
 
-def _draw_arena(axes: Axes, targets: Float64Array, config: ArenaConfig) -> None:
+def _draw_arena(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
     size, side = config.size_px, config.target_size_px
     middle = config.wall_offset_px + config.wall_thickness_px / 2
     inside = size - 2 * middle
     axes.add_patch(Rectangle((0, 0), size, size, fc="#fafafa", ec="#888888", lw=0.8))
     axes.add_patch(Rectangle((middle, middle), inside, inside, fill=False, ec="#d03030", lw=1.3))
-    for x, y in targets:
+    for x0, y0, x1, y1 in config.inner_walls_px:
+        axes.plot([x0, x1], [y0, y1], color="#d03030", lw=1.3)
+    for x, y, radius in episode.obstacles:
+        axes.add_patch(Circle((x, y), radius, fc="#30a030", zorder=1))
+    for x, y in episode.targets:
         axes.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, fc="#2050d0", zorder=1))
     axes.set_xlim(-5, size + 5)
     axes.set_ylim(size + 5, -5)  # y points down, as in the arena's picture

@@ -18,7 +18,7 @@ def film_frames(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Itera
     for number, episode in enumerate(episodes, 1):
         last = len(episode.robots) - 1
         for frame, robots in enumerate(episode.robots):
-            scene = Scene(robots, episode.targets)
+            scene = Scene(robots, episode.targets, episode.obstacles)
             views = codec.decode(codec.encode(scene))
             ending = f"   {episode.outcome.value}" if frame == last else ""
             caption = f"episode {number} of {len(episodes)}   frame {frame}{ending}"

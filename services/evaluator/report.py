@@ -38,7 +38,7 @@ def draw_episodes(run_dir: Path) -> None:
     results = play(arena, starts, shown.player(_SEED), keep_paths=True)
     if results is None:
         raise CheckpointError(f"{run_dir}: no episode was played")
-    paths = [Path2D(r.robots, r.targets, r.outcome) for r in results]
+    paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]
     trajectories(paths, arena, run_dir / "trajectories.png")
     write_film(run_dir / "evaluation.mp4", film_frames(arena, shortest(results)), FPS)
 

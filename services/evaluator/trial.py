@@ -29,7 +29,8 @@ class EpisodeResult:
     outcome: Outcome
     frames: int
     score: float  # sum of rewards, mean over robots
-    targets: Float64Array  # [K, 2] px
+    targets: Float64Array  # [M, 2] px
+    obstacles: Float64Array  # [O, 3] px
     robots: Float64Array  # [frames + 1, K, 3]; [0, K, 3] where paths are not kept
     journey: Journey
 
@@ -183,6 +184,7 @@ def _result(
         frames=len(episode.path),
         score=episode.score,
         targets=scene.targets,
+        obstacles=scene.obstacles,
         robots=path if keep_path else path[:0],
         journey=journey(
             path,

@@ -165,6 +165,15 @@ IMPOSSIBLE = {
     "half a robot": ({"arena.num_robots": "2.5"}, "arena.num_robots: .*given 2.5"),
     "robots as wide as the arena": ({"arena.robot_radius_px": "300"}, "no robot of radius 300"),
     "a target too few": ({"arena.targets_px": "[[1, 2]]"}, "1 targets for 2 robots; give 2, one a"),
+    "an obstacle without size": ({"arena.obstacles_px": "[[1, 2, 0]]"}, "radius that is not above"),
+    "an inner wall without length": (
+        {"arena.inner_walls_px": "[[1, 2, 1, 2]]"},
+        "a wall without length",
+    ),
+    "a step over an obstacle": (
+        {"arena.num_obstacles": "1", "arena.step_px": "50"},
+        "step_px 50 is not below a robot's width",
+    ),
     "targets for some robots only": ({"arena.num_targets": "1"}, "leaves 2 robots without"),
     "counters in poses": ({"arena.kind": "counting"}, 'codec = "frames"'),
     "a schedule from nowhere": ({"exploration.schedule": "[[5, 1.0]]"}, "rise from 0"),

@@ -32,6 +32,7 @@ __all__ = [
 
 CONTROLLERS = ("random", "greedy", "potential_field", "orca", "safe_circle")
 """Names that `controller` takes."""
+_OPEN_FIELD = ("orca", "safe_circle")  # know of nothing that stands between the walls
 
 
 def check_controller(name: str) -> str:
@@ -44,8 +45,17 @@ def check_controller(name: str) -> str:
 
 
 def controller(name: str, config: ArenaConfig, rng: np.random.Generator) -> Controller:
-    """A new controller for one episode; raises ConfigError for an unknown name."""
-    match check_controller(name):
+    """A new controller for one episode.
+
+    Raises ConfigError for an unknown name, and for a world that the controller cannot play in.
+    """
+    check_controller(name)
+    if name in _OPEN_FIELD and (config.obstacle_count or config.inner_walls_px):
+        raise ConfigError(
+            f"controller {name!r} knows of no obstacles and inner walls; "
+            "take potential_field, greedy or random"
+        )
+    match name:
         case "greedy":
             return lambda scene: greedy_actions(scene, config)
         case "potential_field":

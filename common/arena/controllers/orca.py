@@ -18,7 +18,7 @@ from common.arena.controllers.heading import (
     directions,
     shortest_assignment,
 )
-from common.arena.layout import reachable_px
+from common.arena.obstacles import reachable_px
 from common.arena.scene import LEFT, Scene
 from common.config import ArenaConfig
 from common.trajectory import Float64Array, Int64Array, UInt8Array

@@ -7,7 +7,7 @@ first scene is kept.
 import numpy as np
 
 from common.arena.controllers.heading import actions_towards, bearings_rad, shortest_assignment
-from common.arena.layout import reachable_px
+from common.arena.obstacles import reachable_px, ways_from
 from common.arena.scene import Scene
 from common.config import ArenaConfig
 from common.trajectory import Float64Array, Int64Array, UInt8Array
@@ -19,7 +19,7 @@ _LEAST_PX = 1.0  # a smaller gap repels no more than this
 
 
 class PotentialField:
-    """Each robot is drawn to its target, and pushed off by robots and walls that are near."""
+    """Each robot is drawn to its target, and pushed off by whatever is near."""
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
@@ -34,6 +34,7 @@ class PotentialField:
         distances = np.linalg.norm(aims, axis=1, keepdims=True)
         forces = aims / np.maximum(distances, _LEAST_PX)
         forces = forces + self._from_robots(places) + self._from_walls(places)
+        forces = forces + self._from_obstacles(places, scene.obstacles)
         return actions_towards(scene.robots[:, 2], bearings_rad(forces), self._config)
 
     def _from_robots(self, places: Float64Array) -> Float64Array:
@@ -55,6 +56,16 @@ class PotentialField:
             _strength(high - places, _WALLS_FROM_PX),
         )
         return near - far
+
+    def _from_obstacles(self, places: Float64Array, obstacles: Float64Array) -> Float64Array:
+        """Push [K, 2] by obstacles and inner walls."""
+        ways, widths = ways_from(self._config, places, obstacles)
+        distances = np.linalg.norm(ways, axis=2)
+        gaps = distances - widths - self._config.robot_radius_px
+        push: Float64Array = ((_strength(gaps, _WALLS_FROM_PX) / distances)[..., None] * ways).sum(
+            axis=1
+        )
+        return push
 
 
 def _strength(gaps_px: Float64Array, from_px: float) -> Float64Array:

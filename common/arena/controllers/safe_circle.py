@@ -20,7 +20,7 @@ from common.arena.controllers.heading import (
     left_over_rad,
     shortest_assignment,
 )
-from common.arena.layout import reachable_px
+from common.arena.obstacles import reachable_px
 from common.arena.rewards import target_distances_px
 from common.arena.scene import LEFT, RIGHT, STRAIGHT, Scene
 from common.config import ArenaConfig

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from common.arena import Arena, ArrayPhysics, Scene, starts
 from common.arena.controllers import CONTROLLERS, SafeCircle, controller, greedy_actions
 from common.arena.controllers.heading import actions_towards, shortest_assignment
-from common.arena.layout import reachable_px
+from common.arena.obstacles import reachable_px
 from common.arena.rewards import target_distances_px
 from common.config import ArenaConfig
 from common.errors import ConfigError
@@ -141,10 +141,35 @@ def least_gap(config: ArenaConfig, poses: Float64Array, sides: Float64Array) -> 
     return float(min(walls, apart - 2 * config.robot_radius_px))
 
 
+@pytest.mark.parametrize(
+    "settings", [{"num_obstacles": 3}, {"inner_walls_px": ((300, 200, 300, 400),)}]
+)
+def test_controllers_play_among_obstacles_or_say_that_they_cannot(
+    settings: dict[str, object],
+) -> None:
+    config = ArenaConfig.model_validate({"max_frames": 400, **settings})
+    rng = np.random.default_rng(0)
+    for name in CONTROLLERS:
+        if name in ("orca", "safe_circle"):
+            with pytest.raises(ConfigError, match=f"{name}.* no obstacles"):
+                controller(name, config, rng)
+        else:
+            controller(name, config, rng)
+    game = Arena(config, rng, max_collisions=1)
+    wins = 0
+    for start in starts.test_starts(config, 20, seed=0):
+        play = controller("potential_field", config, rng)
+        step = game.reset(start)
+        while not step.last:
+            step = game.step(play(game.scene))
+        wins += step.outcome is Outcome.SUCCESS
+    assert wins >= 15
+
+
 def test_circling_stays_on_its_circle() -> None:
     config = ArenaConfig(num_robots=1)
     physics = ArrayPhysics(config, 1)
-    physics.place(0, np.array([[300.0, 300.0, 0.3]]))
+    physics.place(0, np.array([[300.0, 300.0, 0.3]]), np.empty((0, 3)))
     places = []
     for _ in range(360):
         physics.move(np.array([0]), np.zeros((1, 1), np.uint8))

@@ -121,7 +121,7 @@ def test_misuse_is_refused() -> None:
     for game in (arena(), counting()):
         with pytest.raises(ValueError, match="reset first"):
             game.step(GO)
-    with pytest.raises(ValueError, match="this arena has 2 and 2"):
+    with pytest.raises(ValueError, match=r"this arena has .*2, 3"):
         arena().reset(Start(np.zeros((3, 3)), np.zeros((3, 2))))
     with pytest.raises(ValueError, match="targets"):
         arena().reset(Start(start((100, 100, 0), (200, 200, 0)).robots, TARGETS * np.nan))

@@ -12,13 +12,15 @@ from common.arena import (
     RIGHT,
     STRAIGHT,
     ArrayPhysics,
+    Layout,
     Physics,
     PymunkPhysics,
     Scene,
-    layout_symmetries,
+    Start,
+    Symmetry,
     training_start,
 )
-from common.arena.layout import reachable_px
+from common.arena.obstacles import obstacles_for, reachable_px, room_px
 from common.config import ArenaConfig
 from common.trajectory import BoolArray, Float64Array, UInt8Array
 
@@ -27,15 +29,18 @@ EAST, SOUTH, WEST, NORTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 GO = STRAIGHT
 
 
+NO_OBSTACLES = np.empty((0, 3))
 PHYSICS = {"array": ArrayPhysics, "pymunk": PymunkPhysics}
 
 
 class World:
     """One arena's robots, moved by the physics that the configuration names."""
 
-    def __init__(self, config: ArenaConfig, robots: Float64Array) -> None:
+    def __init__(
+        self, config: ArenaConfig, robots: Float64Array, obstacles: Float64Array = NO_OBSTACLES
+    ) -> None:
         self._physics: Physics = PHYSICS[config.physics](config, 1)
-        self._physics.place(0, robots)
+        self._physics.place(0, robots, obstacles)
         self.hit_wall = np.zeros(len(robots), np.bool_)
 
     @property
@@ -50,7 +55,8 @@ class World:
 
 def world(*robots: tuple[float, float, float], **settings: object) -> World:
     config = ArenaConfig.model_validate({"num_robots": len(robots), **settings})
-    return World(config, np.array(robots, np.float64))
+    obstacles = np.array(config.obstacles_px, np.float64).reshape(-1, 3)
+    return World(config, np.array(robots, np.float64), obstacles)
 
 
 @pytest.fixture(params=PHYSICS)
@@ -130,6 +136,34 @@ def test_a_robot_blocked_while_backing_off_does_not_collide(physics: str) -> Non
 
 
 @pytest.mark.parametrize(
+    ("robot", "blocked"),
+    [
+        # a disc of radius 20 at (300, 300): centres stay 45 px away
+        ((252.5, 300, EAST), False),
+        ((252.6, 300, EAST), True),
+        # a wall 2 px thick from (100, 200) to (100, 400): centres stay 26 px away, also at its end
+        ((128.5, 300, WEST), False),
+        ((128.4, 300, WEST), True),
+        ((71.6, 300, EAST), True),
+        ((100, 171.5, SOUTH), False),
+        ((100, 171.6, SOUTH), True),
+        ((74.5, 170.0, SOUTH), False),
+    ],
+)
+def test_obstacles_stop_robots(
+    physics: str, robot: tuple[float, float, float], blocked: bool
+) -> None:
+    arena = world(
+        robot,
+        obstacles_px=((300, 300, 20),),
+        inner_walls_px=((100, 200, 100, 400),),
+        physics=physics,
+    )
+    assert arena.move(actions(GO)).tolist() == [blocked]
+    assert arena.hit_wall.tolist() == [blocked]
+
+
+@pytest.mark.parametrize(
     "robots",
     [
         [(36.9, 300, 0)],
@@ -138,23 +172,36 @@ def test_a_robot_blocked_while_backing_off_does_not_collide(physics: str) -> Non
         [(300, math.nan, 0)],
         [(300, 300, math.inf)],
         [(300, 300, 0), (349, 300, 0)],
+        [(456, 400, 0)],
+        [(100, 226, 0)],
     ],
 )
 def test_impossible_places_are_refused(
     physics: str, robots: list[tuple[float, float, float]]
 ) -> None:
+    fixed = {"obstacles_px": ((500, 400, 20),), "inner_walls_px": ((100, 100, 100, 201),)}
     with pytest.raises(ValueError, match="robot"):
-        world(*robots, physics=physics)
+        world(*robots, **fixed, physics=physics)
 
 
-def crowd(seed: int, **settings: object) -> tuple[ArenaConfig, Float64Array, np.random.Generator]:
+OBSTRUCTED = {
+    "size_px": 400,
+    "obstacles_px": ((320, 300, 15),),
+    "num_obstacles": 1,
+    "obstacle_radius_px": 20,
+    "inner_walls_px": ((120, 60, 120, 160), (40, 250, 150, 330)),
+}
+
+
+def crowd(seed: int, **settings: object) -> tuple[ArenaConfig, Start, np.random.Generator]:
     """A full arena, in which there is no lack of collisions."""
     config = ArenaConfig.model_validate({"num_robots": 5, "size_px": 270, **settings})
     rng = np.random.default_rng(seed)
-    return config, training_start(config, np.zeros((5, 2)), rng).robots, rng
+    layout = Layout(np.zeros((5, 2)), obstacles_for(config, np.empty((0, 2)), rng))
+    return config, training_start(config, layout, rng), rng
 
 
-def clear(config: ArenaConfig, robots: Float64Array) -> bool:
+def clear(config: ArenaConfig, robots: Float64Array, obstacles: Float64Array) -> bool:
     low, high = reachable_px(config)
     first, second = np.triu_indices(len(robots), 1)
     gaps = np.hypot(*(robots[first, :2] - robots[second, :2]).T)
@@ -163,6 +210,7 @@ def clear(config: ArenaConfig, robots: Float64Array) -> bool:
         (gaps >= 2 * config.robot_radius_px - 1e-9).all()
         and (places >= low - 1e-9).all()
         and (places <= high + 1e-9).all()
+        and (room_px(config, places, obstacles) >= -1e-9).all()
     )
 
 
@@ -170,21 +218,24 @@ def clear(config: ArenaConfig, robots: Float64Array) -> bool:
 @given(
     seed=st.integers(0, 2**32 - 1),
     back_off=st.sampled_from([0, 3]),
-    step=st.sampled_from([2.5, 20.0, 80.0]),
+    world_and_step=st.sampled_from([({}, 2.5), ({}, 80.0), (OBSTRUCTED, 2.5), (OBSTRUCTED, 30.0)]),
 )
-def test_robots_never_overlap_nor_leave(seed: int, back_off: int, step: float) -> None:
-    config, robots, rng = crowd(seed, back_off_frames=back_off, step_px=step)
-    arena = World(config, robots)
+def test_robots_never_overlap_nor_leave(
+    seed: int, back_off: int, world_and_step: tuple[dict[str, object], float]
+) -> None:
+    fixed, step = world_and_step
+    config, start, rng = crowd(seed, back_off_frames=back_off, step_px=step, **fixed)
+    arena = World(config, start.robots, start.obstacles)
     for _ in range(60):
         arena.move(rng.integers(0, 3, 5, dtype=np.uint8))
-        assert clear(config, arena.robots)
+        assert clear(config, arena.robots, start.obstacles)
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), order=st.permutations(range(5)))
 def test_the_order_of_robots_does_not_matter(seed: int, order: list[int]) -> None:
-    config, robots, rng = crowd(seed)
-    one, other = World(config, robots), World(config, robots[order])
+    config, start, rng = crowd(seed)
+    one, other = World(config, start.robots), World(config, start.robots[order])
     for _ in range(60):
         moves = rng.integers(0, 3, 5, dtype=np.uint8)
         collided = one.move(moves)
@@ -193,20 +244,28 @@ def test_the_order_of_robots_does_not_matter(seed: int, order: list[int]) -> Non
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), which=st.integers(0, 7))
-def test_a_mapped_world_gives_the_mapped_outcome(seed: int, which: int) -> None:
-    config, robots, rng = crowd(seed, target_layout="random")
-    symmetry = layout_symmetries(config)[which]
+@given(seed=st.integers(0, 2**32 - 1), flags=st.tuples(*[st.booleans()] * 3), bare=st.booleans())
+def test_a_mapped_world_gives_the_mapped_outcome(
+    seed: int, flags: tuple[bool, bool, bool], bare: bool
+) -> None:
+    config, start, rng = crowd(seed, **({} if bare else OBSTRUCTED))
+    symmetry = Symmetry(*flags)
 
-    def mapped(poses: Float64Array) -> Float64Array:
-        return symmetry.apply_to_scene(Scene(poses, np.zeros((5, 2))), config.size_px).robots
+    def mapped(poses: Float64Array) -> Scene:
+        scene = Scene(poses, np.zeros((5, 2)), start.obstacles)
+        return symmetry.apply_to_scene(scene, config.size_px)
 
-    one, other = World(config, robots), World(config, mapped(robots))
+    ends = np.array(config.inner_walls_px).reshape(-1, 2)
+    walls = symmetry.apply_to_points(ends, config.size_px).reshape(-1, 4).tolist()
+    turned_config = config.model_copy(update={"inner_walls_px": tuple(map(tuple, walls))})
+    turned_start = mapped(start.robots)
+    one = World(config, start.robots, start.obstacles)
+    other = World(turned_config, turned_start.robots, turned_start.obstacles)
     for _ in range(60):
         moves = rng.integers(0, 3, 5, dtype=np.uint8)
         collided = one.move(moves)
         np.testing.assert_array_equal(other.move(symmetry.apply_to_actions(moves)), collided)
-        expected = mapped(one.robots)
+        expected = mapped(one.robots).robots
         np.testing.assert_allclose(other.robots[:, :2], expected[:, :2], atol=1e-7)
         turned = np.exp(1j * (other.robots[:, 2] - expected[:, 2]))
         np.testing.assert_allclose(turned, 1, atol=1e-9)
@@ -235,8 +294,8 @@ def by_the_rule(
 
 
 def test_collisions_are_what_the_rule_says(physics: str) -> None:
-    config, robots, rng = crowd(1, physics=physics)
-    arena = World(config, robots)
+    config, start, rng = crowd(1, physics=physics)
+    arena = World(config, start.robots)
     low, high = reachable_px(config)
     seen = 0
     for _ in range(1000):
@@ -261,25 +320,31 @@ def test_collisions_are_what_the_rule_says(physics: str) -> None:
     step=st.sampled_from([2.5, 7.3, 60.0]),
     turn=st.sampled_from([23.0, 90.0, 171.3]),
     offset=st.sampled_from([10.0, 0.0, 3.7]),
+    bare=st.booleans(),
 )
 def test_the_array_is_pymunk_to_the_bit(
-    seed: int, num_robots: int, back_off: int, step: float, turn: float, offset: float
+    seed: int, num_robots: int, back_off: int, step: float, turn: float, offset: float, bare: bool
 ) -> None:
-    config = ArenaConfig(
-        num_robots=num_robots,
-        size_px=round(60 + 100 * num_robots**0.5),
-        back_off_frames=back_off,
-        step_px=step,
-        turn_deg=turn,
-        wall_offset_px=offset,
+    fixed = {} if bare else OBSTRUCTED
+    config = ArenaConfig.model_validate(
+        {
+            "num_robots": num_robots,
+            "size_px": round(60 + 100 * num_robots**0.5),
+            "back_off_frames": back_off,
+            "step_px": step if bare else min(step, 30),
+            "turn_deg": turn,
+            "wall_offset_px": offset,
+            **fixed,
+        }
     )
     rng = np.random.default_rng(seed)
     one, other = ArrayPhysics(config, 2), PymunkPhysics(config, 2)
     for arena in (0, 1):
-        robots = training_start(config, np.zeros((num_robots, 2)), rng).robots
+        obstacles = obstacles_for(config, np.empty((0, 2)), rng)
+        robots = training_start(config, Layout(np.empty((0, 2)), obstacles), rng).robots
         robots[:, 2] *= rng.choice([1, 5])  # headings are given as anyone likes
-        one.place(arena, robots)
-        other.place(arena, robots)
+        one.place(arena, robots, obstacles)
+        other.place(arena, robots, obstacles)
     for _ in range(60):
         arenas = np.flatnonzero(rng.random(2) < 0.9)
         if len(arenas):

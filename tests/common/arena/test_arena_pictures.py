@@ -12,11 +12,18 @@ from common.arena import Scene, Symmetry, draw_arena, literal_views, make_codec,
 from common.config import ArenaConfig
 from common.trajectory import UInt8Array
 
+OBSTRUCTED = {
+    "num_robots": 4,
+    "target_layout": "random",
+    "num_obstacles": 2,
+    "obstacles_px": ((300, 120, 35),),
+    "inner_walls_px": ((250, 300, 350, 300), (420, 330, 500, 460)),
+}
 EVERY = [Symmetry(*flags) for flags in product((False, True), repeat=3)]
 
 
 def scenes(config: ArenaConfig, num: int, seed: int = 0) -> list[Scene]:
-    return [Scene(s.robots, s.targets) for s in starts.test_starts(config, num, seed)]
+    return [Scene(s.robots, s.targets, s.obstacles) for s in starts.test_starts(config, num, seed)]
 
 
 def views(config: ArenaConfig, scene: Scene) -> UInt8Array:
@@ -44,6 +51,35 @@ def test_analytic_is_what_opencv_draws(crop_px: int, orientation: str) -> None:
     assert abs(np.mean(errors)) < 0.1
 
 
+@pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
+def test_analytic_draws_obstacles_as_opencv_does(orientation: str) -> None:
+    config = ArenaConfig.model_validate({**OBSTRUCTED, "orientation": orientation})
+    pairs = [(views(config, s), literal_views(s, config)) for s in scenes(config, 60)]
+    errors = np.array([one.astype(int) - other for one, other in pairs])
+    assert np.abs(errors).mean() < 0.3
+    assert abs(errors.mean()) < 0.1
+
+
+def test_an_obstacle_has_its_own_grey() -> None:
+    config = ArenaConfig(num_robots=1, obstacles_px=((300, 200, 30),))
+    scene = Scene(
+        np.array([[300.0, 300, 0]]), np.array([[500.0, 500]]), np.array([[300.0, 200, 30]])
+    )
+    view = views(config, scene)[0]
+    assert view[20, 30] == 150
+    assert literal_views(scene, config)[0, 20, 30] == 150
+    assert view[15:25, 25:35].sum() == pytest.approx(150 * np.pi * 9, rel=0.15)
+    picture = draw_arena(scene, config)
+    assert (picture == (0, 255, 0)).all(axis=2).sum() == pytest.approx(np.pi * 900, rel=0.02)
+
+
+def test_an_inner_wall_covers_its_area() -> None:
+    config = ArenaConfig(num_robots=1, inner_walls_px=((200, 150, 300, 225),), renderer="literal")
+    scene = Scene(np.array([[300.0, 400, 0]]), np.array([[500.0, 500]]))
+    picture = draw_arena(scene, config)[100:250, 150:350]
+    assert (picture == (0, 0, 255)).all(axis=2).sum() == pytest.approx(2 * 125, rel=0.15)
+
+
 def test_a_picture_by_hand() -> None:
     """One robot in the middle of its arena, heading east; a pixel is 10 px."""
     config = ArenaConfig(num_robots=1, targets_px=((455, 305),), robot_radius_px=30)
@@ -68,9 +104,10 @@ def test_heading_up_puts_ahead_at_the_top() -> None:
         assert (view == 29).sum() >= 1
 
 
+@pytest.mark.parametrize("num_obstacles", [0, 3])
 @pytest.mark.parametrize("symmetry", EVERY)
-def test_the_mapped_scene_gives_the_mapped_picture(symmetry: Symmetry) -> None:
-    config = ArenaConfig(num_robots=4, target_layout="random")
+def test_the_mapped_scene_gives_the_mapped_picture(symmetry: Symmetry, num_obstacles: int) -> None:
+    config = ArenaConfig(num_robots=4, target_layout="random", num_obstacles=num_obstacles)
     for scene in scenes(config, 40):
         mapped = views(config, symmetry.apply_to_scene(scene, config.size_px)).astype(int)
         gaps = np.abs(mapped - symmetry.apply_to_pictures(views(config, scene)))
@@ -102,12 +139,17 @@ def test_actions_are_swapped_by_mirrors_only() -> None:
 
 @pytest.mark.parametrize("renderer", ["analytic", "literal"])
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
-def test_codecs_give_the_same_pixels(renderer: str, orientation: str) -> None:
-    base = {"num_robots": 3, "renderer": renderer, "orientation": orientation}
-    by_scene = make_codec(ArenaConfig.model_validate({**base, "codec": "scene"}))
+@pytest.mark.parametrize(("world", "record_bytes"), [({"num_robots": 3}, 60), (OBSTRUCTED, 116)])
+def test_codecs_give_the_same_pixels(
+    renderer: str, orientation: str, world: dict[str, Any], record_bytes: int
+) -> None:
+    base = {**world, "renderer": renderer, "orientation": orientation}
+    config = ArenaConfig.model_validate({**base, "codec": "scene"})
+    by_scene = make_codec(config)
     by_frame = make_codec(ArenaConfig.model_validate({**base, "codec": "frames"}))
-    assert (by_scene.record_bytes, by_frame.record_bytes) == (60, 3600)
-    for scene in scenes(ArenaConfig(num_robots=3), 5):
+    assert (by_scene.record_bytes, by_frame.record_bytes) == (record_bytes, 3600)
+    assert config.record_bytes == record_bytes
+    for scene in scenes(config, 5):
         one, other = (c.decode(c.encode(scene)) for c in (by_scene, by_frame))
         np.testing.assert_array_equal(one, other)
 
@@ -168,11 +210,12 @@ def test_decode_refuses_what_does_not_fit(kind: str) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(
-    numbers=st.lists(st.floats(width=32), min_size=10, max_size=10),
+    numbers=st.lists(st.floats(width=32), min_size=13, max_size=13),
     orientation=st.sampled_from(["unrotated", "heading_up"]),
 )
 def test_any_record_gives_some_picture(numbers: list[float], orientation: str) -> None:
-    codec = make_codec(ArenaConfig.model_validate({"orientation": orientation}))
+    config = ArenaConfig.model_validate({"orientation": orientation, "num_obstacles": 1})
+    codec = make_codec(config)
     records = np.array(numbers, "<f4").view(np.uint8)
     assert codec.decode(records).shape == (60, 60)
 

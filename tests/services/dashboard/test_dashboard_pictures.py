@@ -56,7 +56,9 @@ def test_training_curve_of_a_directory_without_records(tmp_path: Path) -> None:
 def test_trajectories_show_starts_and_targets(tmp_path: Path, num_episodes: int) -> None:
     robots = np.stack([np.linspace((100, 200, 0), (400, 200 + 50 * k, 1), 40) for k in range(3)], 1)
     targets = np.array([[400.0, 200.0], [400.0, 250.0], [100.0, 500.0]])
-    episodes = [Path2D(robots, targets, Outcome.SUCCESS)] * num_episodes
+    episodes = [
+        Path2D(robots, targets, np.array([[300.0, 200, 30]]), Outcome.SUCCESS)
+    ] * num_episodes
     trajectories(episodes, ArenaConfig(num_robots=3), tmp_path / "paths.png")
     with Image.open(tmp_path / "paths.png") as image:
         colours = {tuple(pixel) for pixel in np.asarray(image.convert("RGB")).reshape(-1, 3)}
@@ -65,7 +67,8 @@ def test_trajectories_show_starts_and_targets(tmp_path: Path, num_episodes: int)
 
 
 def test_an_episode_of_one_frame_can_be_drawn(tmp_path: Path) -> None:
-    still = Path2D(np.full((1, 2, 3), 100.0), np.full((2, 2), 300.0), Outcome.COLLISION)
+    robots, targets = np.full((1, 2, 3), 100.0), np.full((2, 2), 300.0)
+    still = Path2D(robots, targets, np.empty((0, 3)), Outcome.COLLISION)
     trajectories([still], ArenaConfig(), tmp_path / "paths.png")
     assert (tmp_path / "paths.png").exists()
 

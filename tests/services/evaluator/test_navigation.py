@@ -118,7 +118,7 @@ def test_play_tells_whom_a_robot_ran_into(
 
     rng = np.random.default_rng(0)
     player = ControllerPlayer(lambda: straight, 0.0, rng)
-    start = Start(np.array(robots), layout_for(config, rng))
+    start = Start(np.array(robots), layout_for(config, rng).targets)
     (result,) = play(config, [start], player) or []
     assert result.outcome is COLLISION
     assert result.journey.hit_robot.tolist() == hit_robot

@@ -15,7 +15,9 @@ SUCCESS, COLLISION, TIMEOUT = Outcome.SUCCESS, Outcome.COLLISION, Outcome.TIMEOU
 
 
 def episode(outcome: Outcome, frames: int = 10, score: float = 1.0) -> EpisodeResult:
-    return EpisodeResult(outcome, frames, score, np.zeros((2, 2)), np.empty((0, 2, 3)), JOURNEY)
+    return EpisodeResult(
+        outcome, frames, score, np.zeros((2, 2)), np.empty((0, 3)), np.empty((0, 2, 3)), JOURNEY
+    )
 
 
 def judged(results: list[EpisodeResult]) -> Evaluation:

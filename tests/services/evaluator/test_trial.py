@@ -67,7 +67,7 @@ def outcomes(results: Sequence[EpisodeResult] | None) -> list[tuple[Outcome, int
 
 
 def start(*robots: tuple[float, float, float]) -> Start:
-    return Start(np.array(robots), layout_for(CONFIG, np.random.default_rng(0)))
+    return Start(np.array(robots), layout_for(CONFIG, np.random.default_rng(0)).targets)
 
 
 TOWARDS = start((300, 300, 0), (360, 300, np.pi))  # collide at once, going straight
