@@ -20,6 +20,7 @@ import numpy as np
 
 from common.errors import WireError
 from common.framing import Part, join_map, padded, split_map
+from common.keys import MAX_NAME
 from common.trajectory import (
     NUM_ACTIONS,
     Chunk,
@@ -47,10 +48,10 @@ class SampleRequest:
 
 
 def _check_chunk(chunk: Chunk) -> str | None:
-    length = len(chunk.actions)
     arrays = (chunk.rewards, chunk.discounts, chunk.bootstrap_offsets)
     if any(a.ndim != 1 for a in (chunk.actions, *arrays, chunk.priorities)):
         return "actions, rewards, discounts, bootstrap_offsets and priorities are vectors"
+    length = len(chunk.actions)
     if length == 0 or any(len(a) != length for a in arrays):
         return "actions, rewards, discounts and bootstrap_offsets differ in length, or are empty"
     if len(chunk.priorities) not in (0, length):
@@ -67,13 +68,12 @@ def _check_chunk(chunk: Chunk) -> str | None:
         return "a bootstrap offset is 0"
     if chunk.sequence < 0 or chunk.weights_version < 0:
         return "sequence or weights_version is negative"
+    if len(chunk.actor) > MAX_NAME:  # replay remembers it
+        return f"actor has more than {MAX_NAME} characters"
     return None
 
 
 def _check_samples(samples: Samples) -> str | None:
-    size = len(samples.actions)
-    if samples.records.ndim != 3:
-        return "records is no array of 3 dimensions"
     vectors = (
         samples.keys,
         samples.probabilities,
@@ -83,7 +83,9 @@ def _check_samples(samples: Samples) -> str | None:
         samples.bootstrap_offsets,
         samples.weights_versions,
     )
-    if any(v.ndim != 1 or len(v) != size for v in vectors) or len(samples.records) != size:
+    if samples.records.ndim != 3 or any(v.ndim != 1 for v in vectors):
+        return "records is no array of 3 dimensions, or another is no vector"
+    if any(len(v) != len(samples.records) for v in vectors):
         return "arrays differ in length"
     if not ((samples.probabilities > 0).all() and (samples.probabilities <= 1).all()):
         return "a probability is not above 0 and at most 1"

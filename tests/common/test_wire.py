@@ -286,6 +286,11 @@ MALFORMED = {
     "too many for an array": (Chunk, changed(CHUNK, records=[[0, *[2**62] * 7], b""]), "records: "),
     "records a vector": (Chunk, changed(CHUNK, records=octets(*range(20))), "no matrix"),
     "too few records": (Chunk, changed(CHUNK, records=[[2, 4], b"a" * 8]), "no matrix"),
+    "actions a number": (Chunk, changed(CHUNK, actions=[[], b"\1"]), "are vectors"),
+    "priorities a number": (Chunk, changed(CHUNK, priorities=[[], b"\0" * 4]), "are vectors"),
+    "long name": (Chunk, changed(CHUNK, actor="a" * 65), "more than 64 characters"),
+    "sampled actions a number": (Samples, changed(SAMPLES, actions=[[], b"\1"]), "is no vector"),
+    "sampled records a matrix": (Samples, changed(SAMPLES, records=[[2, 4], b"a" * 8]), "is no"),
     "actions a matrix": (Chunk, changed(CHUNK, actions=[[2, 1], b"ab"]), "are vectors"),
     "lengths differ": (Chunk, changed(CHUNK, actions=octets(1)), "differ in length"),
     "no transition": (
