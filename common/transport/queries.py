@@ -30,6 +30,7 @@ _HELD = "held: "
 _FAR = "far: "
 _OFFER = re.compile(r"slot (\S+ \d+ \d+ \S+)(?: (\d{1,12}) (\d{1,12}))?")
 _NEAR = re.compile(r"near(?: (\d{1,12}) (\d{1,12}))?")
+_WAITING = 4  # messages of the largest size that may wait for a server
 _LATE_S = 1.0  # Zenoh ends a query at its own timeout; this more is for a callback that is late
 
 
@@ -103,13 +104,19 @@ class Request:
 
 
 class Server:
-    """Requests in the order of their arrival, for one serving thread."""
+    """Requests in the order of their arrival, for one serving thread.
+
+    At most `capacity` wait, and no more bytes of them than of four messages of the largest size.
+    """
 
     def __init__(self, max_message_bytes: int, capacity: int) -> None:
         self._max_bytes = max_message_bytes
-        self._waiting: queue.Queue[Request] = queue.Queue(capacity)
+        self._waiting: queue.Queue[tuple[Request, int]] = queue.Queue(capacity)
+        self._lock = threading.Lock()
+        self._bytes = 0
         self._slots = Slots()
-        self.refused = 0
+        self.refused = 0  # because they were too large
+        self.held = 0  # because too many waited
 
     def offer(self, query: Any) -> None:
         """For Zenoh's callback."""
@@ -118,19 +125,24 @@ class Server:
             self.refused += 1
             Request(query, b"").refuse(f"{size} bytes exceed the limit of {self._max_bytes}")
             return
-        request = Request(query, b"" if query.payload is None else query.payload.to_bytes())
-        try:
-            self._waiting.put_nowait(request)
-        except queue.Full:
-            self.refused += 1
-            request.hold(f"{self._waiting.maxsize} requests are waiting")
+        request = Request(query, query.payload.to_bytes() if size else b"")
+        with self._lock:
+            full = self._waiting.full() or self._bytes + size > _WAITING * self._max_bytes
+            if not full:
+                self._bytes += size
+                self._waiting.put_nowait((request, size))
+        if full:
+            self.held += 1
+            request.hold(f"{self._waiting.qsize()} requests are waiting")
 
     def take(self, timeout_s: float) -> Request | None:
         """The next request; None where none came within `timeout_s`."""
         try:
-            request = self._waiting.get(timeout=timeout_s)
+            request, size = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             return None
+        with self._lock:
+            self._bytes -= size
         try:
             request.open(self._slots, self._max_bytes)
         except SlotError as error:

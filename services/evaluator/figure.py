@@ -176,7 +176,7 @@ def _episodes(shown: Subject, num: int, seed: int) -> list[EpisodeResult]:
 
 
 def _paths(episodes: Sequence[EpisodeResult]) -> list[Path2D]:
-    return [Path2D(e.robots, e.targets, e.outcome) for e in episodes]
+    return [Path2D(e.robots, e.targets, e.obstacles, e.outcome) for e in episodes]
 
 
 def _grey(scene: Scene, config: ArenaConfig) -> UInt8Array:

@@ -193,9 +193,23 @@ def test_a_full_server_holds_further_requests(network: Network) -> None:
     first = client.ask(b"first")
     with pytest.raises(HeldError, match="1 requests are waiting"):
         client.ask(b"second").result()
-    assert server.refused == 1
+    assert (server.held, server.refused) == (1, 0)
     assert answer_next(server, "reply", "done") == b"first"
     assert first.result() == b"done"
+
+
+def test_large_requests_that_wait_are_held_to_four_of_the_largest(small_network: Network) -> None:
+    server = small_network.join().server(KEY)
+    client = small_network.join().client(KEY, "the peer")
+    waiting = [client.ask(b"x" * 900) for _ in range(4)]
+    with pytest.raises(HeldError, match="4 requests are waiting"):
+        client.ask(b"x" * 900).result()
+    for request in waiting:
+        answer_next(server, "reply", "done")
+        assert request.result() == b"done"
+    last = client.ask(b"x" * 900)
+    answer_next(server, "reply", "done")
+    assert last.result() == b"done"
 
 
 def payload_of(item: tuple[str, bytes] | None) -> bytes | None:
