@@ -23,6 +23,8 @@ from services.replay.service import ReplayService
 class NoServer:
     """Nobody asks."""
 
+    refused = 0
+
     def take(self, timeout_s: float) -> None:
         return None
 

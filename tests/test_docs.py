@@ -257,7 +257,7 @@ def published(role: str) -> set[str]:
     """Names of a role's metrics: told by the code where that is cheap, read in it elsewhere."""
     if role == "replay":
         config = Config()
-        return set(ReplayService(config, *build(config), *[MagicMock()] * 3).metrics())
+        return set(ReplayService(config, *build(config), *[MagicMock(refused=0)] * 3).metrics())
     if role == "learner":
         meter = Meter(MagicMock(), MagicMock(), None, MagicMock())
         meter.last = MagicMock()

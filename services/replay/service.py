@@ -46,6 +46,8 @@ class _Request(Protocol):
 
 
 class _Server(Protocol):
+    refused: int  # that were too large to be taken
+
     def take(self, timeout_s: float) -> _Request | None: ...
 
 
@@ -77,6 +79,7 @@ class ReplayService:
         self._stopping = threading.Event()
         self._counts = dict.fromkeys(_COUNTS, 0)
         self._held = {"insert_held": False, "sample_held": False}
+        self._servers = (inserts, samples, priorities)
         self._threads = [
             threading.Thread(target=self._serve, args=(inserts, self._insert), name="insert"),
             threading.Thread(target=self._serve, args=(samples, self._sample), name="sample"),
@@ -157,6 +160,7 @@ class ReplayService:
                 "samples_per_insert": self._limiter.ratio,
                 "bytes": self._table.nbytes,
                 **self._counts,
+                "refused": self._counts["refused"] + sum(s.refused for s in self._servers),
                 **self._held,
             }
 

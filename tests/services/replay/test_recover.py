@@ -28,6 +28,8 @@ CONFIG = load_config(
 class NoServer:
     """Nobody asks."""
 
+    refused = 0
+
     def take(self, timeout_s: float) -> None:
         return None
 

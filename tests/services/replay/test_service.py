@@ -67,6 +67,7 @@ class FakeServer:
     """A queue of requests."""
 
     def __init__(self) -> None:
+        self.refused = 0
         self._waiting: queue.Queue[FakeRequest] = queue.Queue()
 
     def take(self, timeout_s: float) -> FakeRequest | None:
@@ -281,6 +282,14 @@ def test_priorities_decide_what_is_sampled_and_evicted_keys_are_ignored() -> Non
         assert samples.keys.tolist().count(7) >= 999
         metrics = up.service.metrics()
         assert (metrics["priority_updates"], metrics["priorities_ignored"]) == (12, 2)
+
+
+def test_what_was_too_large_to_be_taken_counts_as_refused() -> None:
+    with replay() as up:
+        up.inserts.ask(b"").answer()
+        for server in (up.inserts, up.samples, up.priorities):
+            server.refused = 2
+        assert up.service.metrics()["refused"] == 7
 
 
 def test_a_uniform_table_ignores_priorities() -> None:
