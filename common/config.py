@@ -227,6 +227,9 @@ class ReplayConfig(Section):
     """Transitions; the oldest are replaced. (paper)"""
     min_size: Count = 50_000
     """Transitions before the first sample is given. (paper)"""
+    capacity_bytes: Annotated[int, Field(ge=0)] = 0
+    """Memory that the table takes at most, all of it at the start; fewer transitions are kept where
+    capacity would need more; 0: no limit. (ours)"""
     shards: Count = 1
     """Replay processes that share capacity and min_size; an actor inserts into one, the learner
     samples from all. (ours)"""

@@ -81,7 +81,7 @@ def collate(
         discount=torch.from_numpy(samples.discounts.astype(np.float32)).to(device),
         next_observation=pictures[each, window],
         importance_weights=torch.from_numpy(importance_weights(samples, beta)).to(device),
-        keys=samples.keys,
+        keys=samples.keys.copy(),  # the samples are valid for a while only
     )
 
 

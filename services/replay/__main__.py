@@ -9,6 +9,7 @@ import numpy as np
 
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, ReplayConfig, load_config, to_toml
+from common.errors import ConfigError
 from common.files import RUN_CONFIG
 from common.keys import Keys, check_name
 from common.process import (
@@ -23,7 +24,8 @@ from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
 from services.replay.sampler import PrioritizedSampler, Sampler, UniformSampler
 from services.replay.service import ReplayService
-from services.replay.table import Table
+from services.replay.sum_tree import MAX_NODES, NODE_BYTES
+from services.replay.table import Table, bytes_per_transition
 
 _LOG = logging.getLogger("replay")
 _TICK_S = 0.2
@@ -100,15 +102,17 @@ def open_log(config: Config, directory: Path) -> SegmentLog | None:
 def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, RateLimiter]:
     """The table and limiter a configuration asks for.
 
-    record_bytes: kept of each record, if not all of it.
+    record_bytes: kept of each record, if not all of it. Raises ConfigError where
+    replay.capacity_bytes leave no room for replay.min_size.
     """
+    capacity = capacity_of(config)
     table = Table(
-        capacity=config.replay.shard_capacity,
+        capacity=capacity,
         stack=config.arena.stack,
         n_step=config.agent.n_step,
         chunk_length=config.actor.chunk_length,
         record_bytes=config.arena.record_bytes if record_bytes is None else record_bytes,
-        sampler=make_sampler(config.replay),
+        sampler=make_sampler(config.replay, capacity),
     )
     limiter = RateLimiter.with_tolerance(
         config.replay.samples_per_insert,
@@ -120,11 +124,28 @@ def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, Ra
     return table, limiter
 
 
-def make_sampler(replay: ReplayConfig) -> Sampler:
+def capacity_of(config: Config) -> int:
+    """Transitions of one shard: as configured, or what replay.capacity_bytes allow."""
+    replay = config.replay
+    if not replay.capacity_bytes:
+        return replay.shard_capacity
+    window = config.arena.stack + config.agent.n_step
+    each = bytes_per_transition(window, config.actor.chunk_length, config.arena.record_bytes)
+    each += MAX_NODES * NODE_BYTES * replay.prioritized
+    room = int(replay.capacity_bytes / replay.shards / each)
+    if room < replay.shard_min_size:
+        raise ConfigError(
+            f"replay.capacity_bytes {replay.capacity_bytes} holds {room * replay.shards} "
+            f"transitions of {each:.0f} bytes, fewer than replay.min_size {replay.min_size}"
+        )
+    return min(replay.shard_capacity, room)
+
+
+def make_sampler(replay: ReplayConfig, capacity: int) -> Sampler:
     """The sampler a configuration asks for."""
     rng = np.random.default_rng(replay.seed)
     if replay.prioritized:
-        return PrioritizedSampler(replay.shard_capacity, replay.priority_exponent, rng)
+        return PrioritizedSampler(capacity, replay.priority_exponent, rng)
     return UniformSampler(rng)
 
 

@@ -9,6 +9,9 @@ import numpy as np
 
 from common.trajectory import Float64Array, Int64Array
 
+NODE_BYTES = 8
+MAX_NODES = 4  # for each value
+
 
 class SumTree:
     """`size` values, 0 at first, as the leaves of a binary tree of float64 sums."""

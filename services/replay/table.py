@@ -15,6 +15,8 @@ from common.errors import ConfigError, WireError
 from common.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
 from services.replay.sampler import Sampler
 
+_COLUMNS_BYTES = 8 + 1 + 4 + 4 + 1 + 8  # of one transition
+
 
 @dataclass(frozen=True, slots=True)
 class _Extent:
@@ -24,6 +26,11 @@ class _Extent:
     num_transitions: int
     first_row: int
     num_rows: int
+
+
+def bytes_per_transition(window: int, chunk_length: int, record_bytes: int) -> float:
+    """Memory of records and columns, by the transition; the sampler's comes on top."""
+    return record_bytes * (1 + (window - 1) / chunk_length) + _COLUMNS_BYTES
 
 
 class Table:

@@ -1,5 +1,7 @@
 """Collating finds the right pictures for s and s', and turns pictures and actions together."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -192,3 +194,13 @@ def test_of_equal_probabilities_all_weights_are_exactly_1() -> None:
     samples = make_samples([1] * 7, width=5)
     samples.probabilities[:] = 1 / 93
     assert (importance_weights(samples, 0.4) == 1.0).all()
+
+
+def test_a_batch_keeps_nothing_of_the_samples_memory() -> None:
+    sampled = make_samples([1, 3, 2], width=7)
+    batch = collate(sampled, HostDrawing(decode), 4)
+    parts = (batch.observation, batch.action, batch.reward, batch.discount, batch.next_observation)
+    for array in (*(part.numpy() for part in parts), batch.keys):
+        for field in dataclasses.fields(sampled):
+            source = getattr(sampled, field.name)
+            assert not (isinstance(source, np.ndarray) and np.shares_memory(array, source))
