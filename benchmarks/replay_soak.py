@@ -1,0 +1,179 @@
+"""A replay service at full load for a while: does its memory grow, and how long do requests take?
+
+Starts `mrcdrl replay` and two processes that insert, and sample with priorities, as fast as they
+can. Once the table has been full twice, its memory is noted every few seconds. Prints one line of
+JSON: memory at the beginning, at the end and at most (proportional share, MiB), latencies of a
+request (milliseconds: median, p99, longest), and how much went through.
+"""
+
+import argparse
+import multiprocessing
+import multiprocessing.synchronize
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import emit
+from common.config import Config, load_config, to_toml
+from common.errors import MrcdrlError
+from common.keys import Keys
+from common.process import StopSignal
+from common.trajectory import Chunk, Priorities, Stats
+from common.transport import Session, free_endpoint
+from common.wire import decode
+from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
+
+RUN = "soak"
+LENGTH = 50
+PERIOD_S = 5.0
+CHUNKS_PER_REQUEST = 4
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--capacity", type=int, default=400_000)
+    parser.add_argument("--codec", choices=["scene", "frames"], default="scene")
+    parser.add_argument("--batch-size", type=int, default=32)
+    parser.add_argument("--log-dir", help="where the log goes; by default the system's")
+    arguments = parser.parse_args()
+    config = load_config(
+        "quick",
+        {
+            "arena.num_robots": "4",
+            "arena.codec": arguments.codec,
+            "replay.capacity": str(arguments.capacity),
+            "replay.sampler": "prioritized",
+            "replay.samples_per_insert": "0",
+            "learner.batch_size": str(arguments.batch_size),
+        },
+        environ={},
+    )
+    with tempfile.TemporaryDirectory(prefix="soak-", dir=arguments.log_dir) as folder:
+        emit({"bench": "replay_soak", **vars(arguments), **soak(config, arguments, Path(folder))})
+
+
+def soak(config: Config, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """All figures."""
+    endpoint = free_endpoint()
+    (folder / "config.toml").write_text(to_toml(config), "utf-8")
+    command = [sys.executable, "-m", "services.replay", "--run", RUN, "--listen", endpoint]
+    command += ["--config", str(folder / "config.toml"), "--run-dir", str(folder)]
+    spawn = multiprocessing.get_context("spawn")
+    stop = spawn.Event()
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as service, spawn.Pool(2) as pool:
+        try:
+            inserted = pool.apply_async(insert, (config, endpoint, stop))
+            sampled = pool.apply_async(sample, (config, endpoint, stop))
+            memory = watch(service.pid, config, endpoint, arguments.minutes)
+            stop.set()
+            return {"memory_mib": memory, "insert": inserted.get(60), "sample": sampled.get(60)}
+        finally:
+            stop.set()
+            service.terminate()
+
+
+def watch(process: int, config: Config, endpoint: str, minutes: float) -> dict[str, float]:
+    """Memory of the service while it is at work, from the second time round its table on."""
+    transport = config.transport.model_copy(update={"connect": (endpoint,)})
+    found: list[float] = []
+    with Session(transport) as session:
+        told = session.queue_subscriber(Keys(RUN).every_stats)
+        inserts, due_s = 0.0, time.monotonic()
+        while len(found) < max(2, 60 * minutes / PERIOD_S):
+            item = told.take(1.0)
+            if item is not None:
+                inserts = decode(Stats, item[1]).metrics["inserts"]
+            if inserts > 2 * config.replay.capacity and time.monotonic() >= due_s:
+                due_s = time.monotonic() + PERIOD_S
+                found.append(memory_mib(process))
+    tenth = max(1, len(found) // 10)
+    first, last = np.median(found[:tenth]), np.median(found[-tenth:])
+    return {
+        "begin": round(float(first), 1),
+        "end": round(float(last), 1),
+        "max": round(max(found), 1),
+        "growth": round(float(last / first - 1), 4),
+        "inserts": inserts,
+    }
+
+
+def memory_mib(process: int) -> float:
+    """Proportional share: memory that clients lend counts for a half."""
+    rollup = Path(f"/proc/{process}/smaps_rollup").read_text("ascii")
+    line = next(line for line in rollup.splitlines() if line.startswith("Pss:"))
+    return int(line.split()[1]) / 1024
+
+
+def insert(
+    config: Config, endpoint: str, stop: multiprocessing.synchronize.Event
+) -> dict[str, float]:
+    """Chunks until told to stop."""
+    rng = np.random.default_rng(0)
+    arena = config.arena
+    shape = (arena.stack - 1 + LENGTH + config.agent.n_step, arena.record_bytes)
+    records = [rng.integers(0, 255, shape).astype(np.uint8) for _ in range(64)]
+    seconds: list[float] = []
+    with Session(config.transport.model_copy(update={"connect": (endpoint,)})) as session:
+        writer = ReplayWriter(session, Keys(RUN), 10.0, StopSignal())
+        while not stop.is_set():
+            first = CHUNKS_PER_REQUEST * len(seconds)
+            chunks = [
+                Chunk(
+                    actor="soak",
+                    incarnation=1,
+                    sequence=number,
+                    weights_version=number,
+                    records=records[number % len(records)],
+                    actions=rng.integers(0, 3, LENGTH).astype(np.uint8),
+                    rewards=rng.random(LENGTH).astype(np.float32),
+                    discounts=np.ones(LENGTH, np.float32),
+                    bootstrap_offsets=np.ones(LENGTH, np.uint8),
+                    priorities=rng.random(LENGTH).astype(np.float32),
+                )
+                for number in range(first, first + CHUNKS_PER_REQUEST)
+            ]
+            began = time.perf_counter()
+            writer.insert(chunks)
+            seconds.append(time.perf_counter() - began)
+    return latencies(seconds) | {"transitions": len(seconds) * CHUNKS_PER_REQUEST * LENGTH}
+
+
+def sample(
+    config: Config, endpoint: str, stop: multiprocessing.synchronize.Event
+) -> dict[str, float]:
+    """Mini-batches one at a time, and their priorities, until told to stop."""
+    rng = np.random.default_rng(1)
+    size = config.learner.batch_size
+    seconds: list[float] = []
+    with Session(config.transport.model_copy(update={"connect": (endpoint,)})) as session:
+        ended = StopSignal()
+        reader = ReplayReader(session, Keys(RUN), size, 1, 1, 10.0, ended)
+        writer = PriorityWriter(session, Keys(RUN), ended)
+        while not stop.is_set():
+            began = time.perf_counter()
+            samples = reader.sample()
+            if samples is None:
+                raise MrcdrlError("no mini-batch came")
+            seconds.append(time.perf_counter() - began)
+            writer.update(Priorities(samples.keys, rng.random(size).astype(np.float32)))
+    return latencies(seconds) | {"transitions": len(seconds) * size}
+
+
+def latencies(seconds: list[float]) -> dict[str, float]:
+    """Milliseconds; the first hundred, in which all is set up, left out."""
+    median, p99, longest = np.quantile(np.array(seconds[100:]) * 1000, [0.5, 0.99, 1.0])
+    return {
+        "p50_ms": round(float(median), 3),
+        "p99_ms": round(float(p99), 3),
+        "max_ms": round(float(longest), 1),
+    }
+
+
+if __name__ == "__main__":
+    main()
