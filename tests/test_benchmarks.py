@@ -1,0 +1,78 @@
+"""Benchmarks print one line of JSON with what they promise; no figure in it is a verdict."""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import arena, renderer_error
+
+
+@pytest.fixture(autouse=True)
+def _stay_on_all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
+
+
+def printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], module: Any, *argv: object
+) -> dict[str, Any]:
+    monkeypatch.setattr(sys, "argv", [module.__file__, *map(str, argv)])
+    module.main()
+    (line,) = capsys.readouterr().out.splitlines()
+    result: dict[str, Any] = json.loads(line)
+    assert {"machine", "cores", "versions", "command"} <= set(result)
+    return result
+
+
+def program(path: Path, text: str) -> Path:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+BRIEF = ("--robots", 2, "--arenas", 2, "--seconds", 0.01, "--repeats", 2)
+
+
+def test_arena_measures_every_part_and_the_rival(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    rival = program(tmp_path / "python", "while read seconds; do echo 768; done")
+    result = printed(monkeypatch, capsys, arena, *BRIEF, "--pusht-python", rival)
+    parts = ("physics", "drawing", "both", "literal_drawing", "literal_both")
+    names = {f"{part}_2_robot_steps_per_s" for part in parts} | {"pusht_pictures_per_s"}
+    assert set(result["rates"]) == names
+    assert all(rate["min"] > 0 for rate in result["rates"].values())
+    assert result["rates"]["pusht_pictures_per_s"]["median"] == 768
+    (collecting,) = result["collecting"]
+    assert sum(s for name, s in collecting.items() if name.endswith("_share")) == pytest.approx(
+        1, abs=1e-3
+    )
+
+
+def test_a_rival_that_ends_is_told_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rival = program(tmp_path / "python", "exit 3")
+    monkeypatch.setattr(sys, "argv", ["arena", *map(str, BRIEF), "--pusht-python", str(rival)])
+    with pytest.raises(RuntimeError, match="did not answer: exit code 3"):
+        arena.main()
+
+
+def test_renderer_error_knows_every_size_and_orientation(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    picture = tmp_path / "both.png"
+    result = printed(
+        monkeypatch, capsys, renderer_error,
+        "--scenes", 3, "--crops", 150, 600, "--picture", picture,
+    )  # fmt: skip
+    errors = {(e["orientation"], e["crop_px"]): e for e in result["errors"]}
+    assert set(errors) == {(o, c) for o in ("unrotated", "heading_up") for c in (150, 600)}
+    for error in errors.values():
+        worst = error["worst_pixel"]
+        assert error["worst"] == abs(worst["analytic"] - worst["literal"])
+        assert error["mean_abs"] <= error["mean_abs_where_not_black"] <= error["worst"]
+        above = f"{error['orientation']} {error['crop_px']:g}" in result["above_limit"]
+        assert above == (error["mean_abs"] > 0.5)
+    assert picture.stat().st_size > 10_000
