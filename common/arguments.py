@@ -17,7 +17,10 @@ _DEST = "config:"
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that takes no abbreviations and suggests the nearest flag."""
+    """An ArgumentParser that takes no abbreviations and suggests the nearest flag.
+
+    Flags may stand between the arguments of a list.
+    """
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         kwargs.setdefault("allow_abbrev", False)
@@ -27,7 +30,7 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
-        parsed, unknown = self.parse_known_args(args, namespace)
+        parsed, unknown = self.parse_known_intermixed_args(args, namespace)
         if unknown:
             self._refuse(unknown[0])
         return parsed

@@ -43,6 +43,18 @@ def test_the_help_describes_every_field_with_its_default() -> None:
     assert "gamma X (paper) Default: 0.99" in text
 
 
+def test_flags_may_stand_anywhere() -> None:
+    parser = make_parser()
+    parser.add_argument("figure")
+    parser.add_argument("weights", nargs="*")
+    words = ["comparison", "a", "b"]
+    for flag_at in range(4):
+        argv = [*words[:flag_at], "--agent.kind", "dqn", *words[flag_at:]]
+        parsed = parser.parse_args(argv)
+        assert [parsed.figure, *parsed.weights] == words
+        assert overrides(parsed) == {"agent.kind": "dqn"}
+
+
 def test_only_what_is_given_overrides() -> None:
     assert given() == {}
     assert given("--run-dir", "here", "--agent.gamma=0.9", "--arena.collision_reward", "-7") == {
