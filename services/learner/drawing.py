@@ -64,9 +64,15 @@ class DeviceDrawing:
 
     def __init__(self, config: ArenaConfig, device: torch.device | str) -> None:
         self._views = DeviceViews(config, device)
+        self._record_bytes = config.record_bytes
         self._device = torch.device(device)
 
     def __call__(self, records: UInt8Array, turns: Turns) -> Tensor:
+        if records.dtype != np.uint8 or records.shape[-1] != self._record_bytes:
+            raise ValueError(
+                f"records are {records.dtype} {records.shape}, not uint8 "
+                f"[..., {self._record_bytes}]"
+            )
         numbers = np.array(records, order="C").reshape(-1, records.shape[-1]).view("<f4")
         flat = self._views.draw(torch.from_numpy(numbers).to(self._device))
         pictures = flat.reshape(*records.shape[:-1], *flat.shape[1:])

@@ -98,6 +98,12 @@ def test_records_that_are_packed_read_only_bytes_are_drawn() -> None:
     )
 
 
+def test_records_of_another_arena_are_refused() -> None:
+    given = records(ArenaConfig(num_robots=3), 1)
+    with pytest.raises(ValueError, match=r"not uint8 \[..., 40\]"):
+        DeviceDrawing(ArenaConfig(num_robots=2), "cpu")(given, ())
+
+
 def test_no_records_give_no_pictures() -> None:
     config = ArenaConfig()
     assert DeviceDrawing(config, "cpu")(records(config, 3)[:0], ()).shape == (0, 2, 60, 60)
