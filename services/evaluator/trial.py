@@ -5,7 +5,7 @@ once, each arena taking the next start when its episode ends.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -123,7 +123,7 @@ class _Running:
 
     number: int
     score: float = 0.0
-    path: list[Float64Array] = field(default_factory=list)
+    frames: int = 0
 
 
 def play(
@@ -138,6 +138,8 @@ def play(
     rng = np.random.default_rng(0)  # unused: every start is given
     arenas = ArenaBatch(config, [rng] * min(len(starts), _MAX_ARENAS), max_collisions=1)
     results: dict[int, EpisodeResult] = {}
+    # One block: a million small ones that outlive the network's large ones would leave holes.
+    paths = np.empty((len(arenas), config.max_frames + 1, config.num_robots, 3), np.float64)
     waiting = iter(enumerate(starts))
     running: dict[int, _Running] = {}
 
@@ -163,29 +165,38 @@ def play(
         for i, (index, scene) in enumerate(zip(active.tolist(), scenes, strict=True)):
             episode = running[index]
             episode.score += float(steps.rewards[i].mean())
-            episode.path.append(scene.robots)
+            paths[index, episode.frames] = scene.robots
+            episode.frames += 1
             if steps.outcomes[i] is not None:
+                last = arenas.scene(index)
+                paths[index, episode.frames] = last.robots
+                path = paths[index, : episode.frames + 1]
                 results[episode.number] = _result(
-                    config, episode, arenas.scene(index), steps[i], keep_paths
+                    config, episode.score, path, last, steps[i], keep_path=keep_paths
                 )
                 begin(index)
     return [results[number] for number in range(len(starts))]
 
 
 def _result(
-    config: ArenaConfig, episode: _Running, scene: Scene, last: TimeStep, keep_path: bool
+    config: ArenaConfig,
+    score: float,
+    path: Float64Array,
+    scene: Scene,
+    last: TimeStep,
+    *,
+    keep_path: bool,
 ) -> EpisodeResult:
-    """Of an episode that ended with this scene and time step."""
+    """Of an episode that went along this path [frames + 1, K, 3], to this scene and time step."""
     if last.outcome is None:
         raise ValueError("the episode has not ended")
-    path = np.stack([*episode.path, scene.robots])
     return EpisodeResult(
         outcome=last.outcome,
-        frames=len(episode.path),
-        score=episode.score,
+        frames=len(path) - 1,
+        score=score,
         targets=scene.targets,
         obstacles=scene.obstacles,
-        robots=path if keep_path else path[:0],
+        robots=path.copy() if keep_path else path[:0].copy(),
         journey=journey(
             path,
             scene.targets,
