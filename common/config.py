@@ -75,6 +75,9 @@ class ArenaConfig(Section):
     """Of the random discs. (ours)"""
     inner_walls_px: tuple[tuple[float, float, float, float], ...] = ()
     """Walls (x, y, x, y) from one point to another, as thick as the outer ones. (ours)"""
+    failure_probability: Fraction = 0
+    """Of each robot in each frame: it then stands where it is to the episode's end, and success is
+    that of the others; the last one never fails. (ours)"""
     success_radius_px: Positive = 20
     """delta: every robot this near to a target of its own is success. (paper)"""
     max_collisions: Count = 5

@@ -61,6 +61,8 @@ class ArenaBatch:
         self.collisions: Int64Array = np.zeros(len(rngs), np.int64)
         """Robot collisions of each arena's episode [A]: two when two robots run into one
         another."""
+        self.failed: BoolArray = np.zeros((len(rngs), config.num_robots), np.bool_)
+        """Robots that stand to the end of their episode [A, K]."""
         for arena in range(len(rngs)):
             self._place(arena, self._random_start(arena))
 
@@ -80,6 +82,7 @@ class ArenaBatch:
         self._place(arena, self._random_start(arena) if start is None else start)
         self._running[arena] = True
         self.frames[arena] = self.collisions[arena] = 0
+        self.failed[arena] = False
         num_robots = self._config.num_robots
         return TimeStep(
             step_type=StepType.FIRST,
@@ -100,11 +103,14 @@ class ArenaBatch:
         if not self._running[arenas].all():
             raise ValueError("the episode has ended or not begun: reset first")
         checked = checked_actions(actions, (len(arenas), self._config.num_robots))
-        collided, hit_wall = self._physics.move(arenas, checked)
+        self._fail(arenas)
+        failed = self.failed[arenas]
+        collided, hit_wall = self._physics.move(arenas, checked, failed)
         self.frames[arenas] += 1
         self.collisions[arenas] += collided.sum(axis=1)
         scene = self._scenes(arenas)
-        rewards, success = frame_rewards(scene, collided, self.frames[arenas], self._config)
+        frames = self.frames[arenas]
+        rewards, success = frame_rewards(scene, collided, failed, frames, self._config)
         outcomes = self._outcomes(arenas, success)
         self._running[arenas] = [outcome is None for outcome in outcomes]
         return TimeSteps(
@@ -115,19 +121,29 @@ class ArenaBatch:
             outcomes=outcomes,
         )
 
+    def _fail(self, arenas: Int64Array) -> None:
+        """Draws who fails in this frame, except the last robot that works."""
+        probability = self._config.failure_probability
+        for arena in arenas.tolist() if probability else ():
+            draws = self._rngs[arena].random(self._config.num_robots)
+            working = ~self.failed[arena]
+            self.failed[arena] |= draws < probability
+            if self.failed[arena].all():
+                self.failed[arena, np.where(working, draws, -1).argmax()] = False
+
     def _scenes(self, arenas: Int64Array) -> Scene:
         """Of these arenas [...], a copy: its arrays are [..., K, 3] and so on."""
         return Scene(self._physics.robots[arenas], self._targets[arenas], self._obstacles[arenas])
 
     def _outcomes(self, arenas: Int64Array, success: BoolArray) -> tuple[Outcome | None, ...]:
-        failed = self.collisions[arenas] >= self._max_collisions
+        stopped = self.collisions[arenas] >= self._max_collisions
         late = self.frames[arenas] >= self._config.max_frames
         outcomes: list[Outcome | None] = [None] * len(arenas)
-        for i in np.flatnonzero(success | failed | late).tolist():
+        for i in np.flatnonzero(success | stopped | late).tolist():
             if success[i]:
                 outcomes[i] = Outcome.SUCCESS
             else:
-                outcomes[i] = Outcome.COLLISION if failed[i] else Outcome.TIMEOUT
+                outcomes[i] = Outcome.COLLISION if stopped[i] else Outcome.TIMEOUT
         return tuple(outcomes)
 
     def _random_start(self, arena: int) -> Start:

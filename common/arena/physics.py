@@ -39,10 +39,13 @@ class Physics(Protocol):
         """
         ...
 
-    def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
+    def move(
+        self, arenas: Int64Array, actions: UInt8Array, failed: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
         """Turns and moves every robot of the arenas [N] at once; actions: [N, K].
 
-        Returns who collided [N, K] and, of those, whose way led into a wall or obstacle [N, K].
+        failed: robots [N, K] that stand and are in the others' way. Returns who collided [N, K]
+        and, of those, whose way led into a wall or obstacle [N, K].
         """
         ...
 
@@ -67,13 +70,16 @@ class ArrayPhysics:
         self._obstacles[arena] = obstacles
         self._back_off[arena] = 0
 
-    def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
+    def move(
+        self, arenas: Int64Array, actions: UInt8Array, failed: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
         collided = np.empty(actions.shape, np.bool_)
         hit_wall = np.empty(actions.shape, np.bool_)
         config = self._config
         _move_all(
             arenas,
             actions,
+            failed,
             self._robots,
             self._back_off,
             self._walls,
@@ -116,6 +122,7 @@ def _first_misplaced(robots, bounds, radius, walls, obstacles):  # type: ignore[
 def _move_all(  # type: ignore[no-untyped-def]
     arenas,
     actions,
+    failed,
     robots,
     back_off,
     walls,
@@ -134,6 +141,10 @@ def _move_all(  # type: ignore[no-untyped-def]
         poses, backs = robots[arenas[n]], back_off[arenas[n]]
         blocked, beyond = collided[n], hit_wall[n]
         for i in range(num_robots):
+            if failed[n, i]:
+                places[i, 0], places[i, 1] = poses[i, 0], poses[i, 1]
+                beyond[i] = False
+                continue
             if backs[i] == 0 and actions[n, i] != STRAIGHT:
                 turn = (np.int64(actions[n, i]) - STRAIGHT) * turn_rad
                 poses[i, 2] = _wrapped(poses[i, 2] + turn)
@@ -143,10 +154,13 @@ def _move_all(  # type: ignore[no-untyped-def]
             beyond[i] = _meets_fixed(
                 places[i, 0], places[i, 1], radius, walls, obstacles[arenas[n]]
             )
+        blocked[:] = failed[n]
         _block(poses, places, radius, beyond, blocked, hits)
         for i in range(num_robots):
             poses[i, 0], poses[i, 1] = places[i, 0], places[i, 1]
-            if backs[i] > 0:
+            if failed[n, i]:
+                blocked[i] = False
+            elif backs[i] > 0:
                 backs[i] -= 1
                 blocked[i] = beyond[i] = False
             elif blocked[i]:
@@ -155,8 +169,10 @@ def _move_all(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _block(poses, places, radius, beyond, blocked, hits):  # type: ignore[no-untyped-def]
-    """Puts places [K, 2] that cannot be taken back to the poses', and marks them blocked."""
-    blocked[:] = False
+    """Puts places [K, 2] that cannot be taken back to the poses', and marks them blocked.
+
+    Robots that are blocked already stand where they are.
+    """
     again = True
     while again:
         again = False

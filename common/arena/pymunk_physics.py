@@ -30,11 +30,13 @@ class PymunkPhysics:
     def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
         self._worlds[arena].place(robots, obstacles)
 
-    def move(self, arenas: Int64Array, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
+    def move(
+        self, arenas: Int64Array, actions: UInt8Array, failed: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
         collided = np.empty(actions.shape, np.bool_)
         hit_wall = np.empty(actions.shape, np.bool_)
         for n, arena in enumerate(arenas.tolist()):
-            collided[n], hit_wall[n] = self._worlds[arena].move(actions[n])
+            collided[n], hit_wall[n] = self._worlds[arena].move(actions[n], failed[n])
         return collided, hit_wall
 
 
@@ -70,14 +72,16 @@ class World:
         self._poses = [(x, y, heading) for x, y, heading in robots.tolist()]
         self._back_off = [0] * len(self._poses)
 
-    def move(self, actions: UInt8Array) -> tuple[BoolArray, BoolArray]:
+    def move(self, actions: UInt8Array, failed: BoolArray) -> tuple[BoolArray, BoolArray]:
         """As Physics.move, of this arena: who collided [K], and whose way led into what stays."""
-        turned = [self._turn(i, action) for i, action in enumerate(actions.tolist())]
-        proposals = [self._advance(i, pose) for i, pose in enumerate(turned)]
+        waiting = set(np.flatnonzero(~failed).tolist())
+        turned, proposals = self._poses.copy(), self._poses.copy()
+        for i in waiting:
+            turned[i] = self._turn(i, int(actions[i]))
+            proposals[i] = self._advance(i, turned[i])
         for i, proposal in enumerate(proposals):
             self._put(i, proposal)
-        beyond = {i for i in range(len(proposals)) if self._meets_fixed(i)}
-        waiting = set(range(len(proposals)))
+        beyond = {i for i in waiting if self._meets_fixed(i)}
         blocked: set[int] = set()
         while hits := {i for i in waiting if self._space.shape_query(self._shapes[i])}:
             for i in hits:
@@ -90,7 +94,7 @@ class World:
         collided = np.zeros(len(proposals), np.bool_)
         hit_wall = np.zeros(len(proposals), np.bool_)
         for i, frames in enumerate(self._back_off):
-            if frames:
+            if frames and not failed[i]:
                 self._back_off[i] = frames - 1
             elif i in blocked:
                 self._back_off[i] = self._config.back_off_frames

@@ -14,13 +14,13 @@ from common.trajectory import BoolArray, Float32Array, Float64Array, Int64Array
 
 
 def frame_rewards(
-    scene: Scene, collided: BoolArray, frames: Int64Array, config: ArenaConfig
+    scene: Scene, collided: BoolArray, failed: BoolArray, frames: Int64Array, config: ArenaConfig
 ) -> tuple[Float32Array, BoolArray]:
     """Rewards [N, K] of a frame of N arenas, and in which of them it is success [N].
 
-    scene: of all the arenas [N, ...], after the frame's moves. collided: [N, K]. frames: f of the
-    paper [N], 1 after the first move. A robot that collided gets collision_reward, wherever it
-    stands.
+    scene: of all the arenas [N, ...], after the frame's moves. collided, failed: [N, K]. frames: f
+    of the paper [N], 1 after the first move. A robot that collided gets collision_reward, wherever
+    it stands; one that failed is paid like any other, and success does not wait for it.
     """
     rewards = np.empty(collided.shape, np.float32)
     success = np.empty(len(collided), np.bool_)
@@ -28,6 +28,7 @@ def frame_rewards(
         scene.robots,
         scene.targets,
         collided,
+        failed,
         frames,
         config.success_radius_px,
         on_target_px(config),
@@ -54,7 +55,18 @@ def on_target_px(config: ArenaConfig) -> float:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _judge_all(  # type: ignore[no-untyped-def]
-    robots, targets, collided, frames, delta, reach, proximity, f_max, paid, rewards, success
+    robots,
+    targets,
+    collided,
+    failed,
+    frames,
+    delta,
+    reach,
+    proximity,
+    f_max,
+    paid,
+    rewards,
+    success,
 ):
     success_reward, collision_reward, step_reward = paid
     num_robots, num_targets = robots.shape[1], targets.shape[1]
@@ -65,7 +77,7 @@ def _judge_all(  # type: ignore[no-untyped-def]
                 across = robots[n, i, 0] - targets[n, j, 0]
                 along = robots[n, i, 1] - targets[n, j, 1]
                 distances[i, j] = math.sqrt(across * across + along * along)
-        success[n] = not collided[n].any() and _each_has_its_own(distances, delta)
+        success[n] = not collided[n].any() and _each_has_its_own(distances, delta, failed[n])
         frames_left = 1 - min(frames[n], f_max) / f_max
         for i in range(num_robots):
             nearest = distances[i].min()
@@ -80,17 +92,17 @@ def _judge_all(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _each_has_its_own(distances, delta):  # type: ignore[no-untyped-def]
-    """Whether every robot [K] has a target [M] nearer than delta that no other needs."""
+def _each_has_its_own(distances, delta, failed):  # type: ignore[no-untyped-def]
+    """Whether every robot [K] that works has a target [M] nearer than delta for itself."""
     num_robots, num_targets = distances.shape
     for robot in range(num_robots):
-        if distances[robot].min() >= delta:
+        if not failed[robot] and distances[robot].min() >= delta:
             return False
     owners = np.full(num_targets, -1, np.int64)
     tried = np.empty(num_targets, np.bool_)
     for robot in range(num_robots):
         tried[:] = False
-        if not _seat(robot, distances, delta, owners, tried):
+        if not failed[robot] and not _seat(robot, distances, delta, owners, tried):
             return False
     return True
 

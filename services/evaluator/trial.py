@@ -135,8 +135,9 @@ def play(
     go_on: Callable[[int], bool] = lambda _done: True,
 ) -> list[EpisodeResult] | None:
     """Results in the order of the starts; None where `go_on`, told how many are done, says no."""
-    rng = np.random.default_rng(0)  # unused: every start is given
-    arenas = ArenaBatch(config, [rng] * min(len(starts), _MAX_ARENAS), max_collisions=1)
+    num_arenas = min(len(starts), _MAX_ARENAS)
+    rngs = [np.random.default_rng(i) for i in range(num_arenas)]  # of failures; starts are given
+    arenas = ArenaBatch(config, rngs, max_collisions=1)
     results: dict[int, EpisodeResult] = {}
     # One block: a million small ones that outlive the network's large ones would leave holes.
     paths = np.empty((len(arenas), config.max_frames + 1, config.num_robots, 3), np.float64)

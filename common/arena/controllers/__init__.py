@@ -55,6 +55,11 @@ def controller(name: str, config: ArenaConfig, rng: np.random.Generator) -> Cont
             f"controller {name!r} knows of no obstacles and inner walls; "
             "take potential_field, greedy or random"
         )
+    if name == "safe_circle" and config.failure_probability:
+        raise ConfigError(
+            "controller 'safe_circle' counts on all robots to circle on; where they may fail take "
+            "orca, potential_field, greedy or random"
+        )
     match name:
         case "greedy":
             return lambda scene: greedy_actions(scene, config)

@@ -155,6 +155,8 @@ def test_controllers_play_among_obstacles_or_say_that_they_cannot(
                 controller(name, config, rng)
         else:
             controller(name, config, rng)
+    with pytest.raises(ConfigError, match=r"safe_circle.* may fail"):
+        controller("safe_circle", ArenaConfig(failure_probability=0.1), rng)
     game = Arena(config, rng, max_collisions=1)
     wins = 0
     for start in starts.test_starts(config, 20, seed=0):
@@ -172,7 +174,7 @@ def test_circling_stays_on_its_circle() -> None:
     physics.place(0, np.array([[300.0, 300.0, 0.3]]), np.empty((0, 3)))
     places = []
     for _ in range(360):
-        physics.move(np.array([0]), np.zeros((1, 1), np.uint8))
+        physics.move(np.array([0]), np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.bool_))
         places.append(physics.robots[0, 0, :2].copy())
     across = np.ptp(np.array(places), axis=0)
     assert across == pytest.approx(2 * 6.27, abs=0.05)

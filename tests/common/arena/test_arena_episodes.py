@@ -172,6 +172,46 @@ def test_a_batch_plays_what_its_arenas_would_play_alone(physics: str) -> None:
                 )
 
 
+@pytest.mark.parametrize("physics", ["array", "pymunk"])
+def test_robots_that_fail_stand_and_the_last_one_goes_on(physics: str) -> None:
+    batch = ArenaBatch(
+        ArenaConfig.model_validate(
+            {"num_robots": 4, "failure_probability": 0.05, "physics": physics, "max_frames": 200}
+        ),
+        [np.random.default_rng(seed) for seed in range(3)],
+        max_collisions=10**6,
+    )
+    for index in range(3):
+        batch.reset(index)
+    seen = 0
+    for _ in range(150):
+        before = [batch.scene(index).robots for index in range(3)]
+        steps = batch.step(np.ones((3, 4), int))
+        for index, robots in enumerate(before):
+            still = batch.failed[index]
+            np.testing.assert_array_equal(batch.scene(index).robots[still], robots[still])
+            assert not steps.collided[index, still].any()
+            assert not still.all()
+        seen = max(seen, int(batch.failed.sum(axis=1).max()))
+    assert seen == 3
+    batch.reset(0)
+    assert not batch.failed[0].any()
+
+
+def test_success_does_not_wait_for_a_robot_that_failed() -> None:
+    begin = start((160, 300, 0), (300, 500, 0))  # the first is on a target, the second is not
+    seen = set()
+    for seed in range(10):
+        game = Arena(ArenaConfig(failure_probability=1), np.random.default_rng(seed))
+        game.reset(begin)
+        outcome = game.step(GO).outcome
+        first_stands, second_stands = (game.scene.robots == begin.robots).all(axis=1)
+        assert first_stands != second_stands
+        assert outcome is (Outcome.SUCCESS if second_stands else None)
+        seen.add(outcome)
+    assert len(seen) == 2
+
+
 def fingerprint(physics: str) -> str:
     """A hash of 1 000 seeded steps; the same in another process and with the other physics."""
     base = {"num_robots": 4, "target_layout": "random", "max_collisions": 20}

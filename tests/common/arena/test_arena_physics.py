@@ -42,13 +42,14 @@ class World:
         self._physics: Physics = PHYSICS[config.physics](config, 1)
         self._physics.place(0, robots, obstacles)
         self.hit_wall = np.zeros(len(robots), np.bool_)
+        self.failed = np.zeros(len(robots), np.bool_)
 
     @property
     def robots(self) -> Float64Array:
         return self._physics.robots[0].copy()
 
     def move(self, moves: UInt8Array) -> BoolArray:
-        collided, hit_wall = self._physics.move(np.array([0]), moves[None])
+        collided, hit_wall = self._physics.move(np.array([0]), moves[None], self.failed[None])
         self.hit_wall = hit_wall[0]
         return collided[0]
 
@@ -161,6 +162,15 @@ def test_obstacles_stop_robots(
     )
     assert arena.move(actions(GO)).tolist() == [blocked]
     assert arena.hit_wall.tolist() == [blocked]
+
+
+def test_a_failed_robot_stands_and_stops_others(physics: str) -> None:
+    arena = world((200, 300, EAST), (252, 300, WEST), (300, 500, EAST), physics=physics)
+    arena.failed = np.array([False, True, False])
+    assert arena.move(actions(GO, LEFT, GO)).tolist() == [True, False, False]
+    assert not arena.hit_wall.any()
+    assert arena.robots[1].tolist() == [252, 300, WEST]
+    assert arena.robots[:, 0].tolist() == [200, 252, 302.5]
 
 
 @pytest.mark.parametrize(
@@ -345,12 +355,13 @@ def test_the_array_is_pymunk_to_the_bit(
         robots[:, 2] *= rng.choice([1, 5])  # headings are given as anyone likes
         one.place(arena, robots, obstacles)
         other.place(arena, robots, obstacles)
+    failed = np.zeros((2, num_robots), np.bool_)
     for _ in range(60):
+        failed |= rng.random(failed.shape) < 0.01
         arenas = np.flatnonzero(rng.random(2) < 0.9)
         if len(arenas):
             moves = rng.integers(0, 3, (len(arenas), num_robots), dtype=np.uint8)
-            for ours, theirs in zip(
-                one.move(arenas, moves), other.move(arenas, moves), strict=True
-            ):
-                np.testing.assert_array_equal(ours, theirs)
+            ours = one.move(arenas, moves, failed[arenas])
+            theirs = other.move(arenas, moves, failed[arenas])
+            np.testing.assert_array_equal(ours, theirs)
         assert one.robots.tobytes() == other.robots.tobytes()

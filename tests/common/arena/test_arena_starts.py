@@ -23,6 +23,7 @@ from common.config import ArenaConfig
 from common.errors import ConfigError
 
 NO_OBSTACLES = np.empty((0, 3))
+NONE_FAILED = np.zeros((1, 10), np.bool_)
 
 
 def nearest_pair(points: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> float:
@@ -110,7 +111,9 @@ def test_test_starts_keep_off_obstacles_for_a_rotation() -> None:
     for start in starts.test_starts(config, 30, seed=3):
         physics.place(0, start.robots, start.obstacles)
         for _ in range(math.ceil(360 / 23)):
-            collided, _ = physics.move(np.array([0]), np.full((1, 3), LEFT, np.uint8))
+            collided, _ = physics.move(
+                np.array([0]), np.full((1, 3), LEFT, np.uint8), NONE_FAILED[:, :3]
+            )
             assert not collided.any()
 
 
@@ -183,7 +186,9 @@ def test_test_starts_stay_clear_for_a_rotation(layout: str) -> None:
         physics = ArrayPhysics(config, 1)
         physics.place(0, start.robots, NO_OBSTACLES)
         for _ in range(math.ceil(360 / 23)):
-            collided, _ = physics.move(np.array([0]), np.full((1, 4), LEFT, np.uint8))
+            collided, _ = physics.move(
+                np.array([0]), np.full((1, 4), LEFT, np.uint8), NONE_FAILED[:, :4]
+            )
             assert not collided.any()
         assert Scene(start.robots, start.targets).targets.shape == (4, 2)
 
