@@ -109,6 +109,11 @@ class ArenaConfig(Section):
     renderer: Literal["analytic", "literal"] = "analytic"
     """`literal` draws 600x600, greys, crops, pads and area-resizes as the paper does; `analytic`
     computes the same coverage straight at 60x60. (ours)"""
+    pixel_noise: Annotated[float, Field(ge=0)] = 0
+    """Standard deviation of the noise on every pixel of a robot's picture, in levels of grey.
+    (ours)"""
+    dropped_frame_probability: Annotated[float, Field(ge=0, lt=1)] = 0
+    """Of each robot in each frame: it then sees its picture before once more. (ours)"""
     codec: Literal["scene", "frames"] = "scene"
     """What an observation record holds: poses from which the picture is drawn, or pixels. (ours)"""
 
@@ -124,10 +129,11 @@ class ArenaConfig(Section):
 
     @property
     def record_bytes(self) -> int:
-        """Length of one observation record: the pixels, or poses, targets and obstacles."""
+        """Length of one observation record: the pixels, or all that they are drawn from."""
         if self.codec == "frames":
             return self.view_px * self.view_px
-        return 4 * (3 * self.num_robots + 2 * self.target_count + 3 * self.obstacle_count)
+        layout = 2 * self.target_count + 3 * self.obstacle_count
+        return 4 * (3 * self.num_robots + layout + bool(self.pixel_noise))
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from common.arena.actions import checked_actions
-from common.arena.codec import make_codec
 from common.arena.counting import CountingBatch
 from common.arena.layout import layout_for
 from common.arena.physics import ArrayPhysics, Physics
 from common.arena.pymunk_physics import PymunkPhysics
 from common.arena.rewards import frame_rewards
 from common.arena.scene import Scene, Start
+from common.arena.sensors import Sensors
 from common.arena.starts import training_start
 from common.config import ArenaConfig
 from common.trajectory import (
@@ -50,7 +50,7 @@ class ArenaBatch:
         self._config = config
         self._rngs = rngs
         self._max_collisions = config.max_collisions if max_collisions is None else max_collisions
-        self._codec = make_codec(config)
+        self._sensors = Sensors(config, rngs)
         self._physics = _make_physics(config, len(rngs))
         self._targets = np.zeros((len(rngs), config.target_count, 2))
         self._obstacles = np.zeros((len(rngs), config.obstacle_count, 3))
@@ -86,7 +86,7 @@ class ArenaBatch:
         num_robots = self._config.num_robots
         return TimeStep(
             step_type=StepType.FIRST,
-            records=self._codec.encode(self.scene(arena)),
+            records=self._sensors.first(arena, self.scene(arena)),
             rewards=np.zeros(num_robots, np.float32),
             discount=1.0,
             collided=np.zeros(num_robots, np.bool_),
@@ -114,7 +114,7 @@ class ArenaBatch:
         outcomes = self._outcomes(arenas, success)
         self._running[arenas] = [outcome is None for outcome in outcomes]
         return TimeSteps(
-            records=self._codec.encode(scene),
+            records=self._sensors.read(arenas, scene),
             rewards=rewards,
             collided=collided,
             hit_wall=hit_wall,

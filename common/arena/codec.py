@@ -4,10 +4,12 @@ Invariants: both codecs give the same pixels for the same scene, because both dr
 rounded to float32; a record is a fixed number of bytes.
 """
 
+from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
 
+from common.arena.noise import NoiseSeeds, add_noise
 from common.arena.rendering import literal_views
 from common.arena.scene import Scene
 from common.arena.views import AnalyticViews
@@ -15,6 +17,7 @@ from common.config import ArenaConfig
 from common.trajectory import Float32Array, UInt8Array
 
 _NUMBER = np.dtype("<f4")
+_SEED = np.dtype("<u4")
 
 
 class ObservationCodec(Protocol):
@@ -22,8 +25,11 @@ class ObservationCodec(Protocol):
 
     record_bytes: int
 
-    def encode(self, scene: Scene) -> UInt8Array:
-        """Records [..., K, R] of the robots' views, of one scene or a stack of them."""
+    def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
+        """Records [..., K, R] of the robots' views, of one scene or a stack of them.
+
+        noise_seeds: [..., K], where the pictures are noisy; 0 if None.
+        """
         ...
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
@@ -35,31 +41,35 @@ class SceneCodec:
     """A record is the scene as its robot lists it; the picture is drawn when it is needed.
 
     float32, little-endian: own x, y, heading; x, y, heading of the other robots in their order;
-    x, y of the targets; x, y, radius of the obstacles.
+    x, y of the targets; x, y, radius of the obstacles. Then, with pixel_noise, the seed of the
+    noise as uint32.
     """
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
         num = config.num_robots
-        self._ends = (3 * num, 3 * num + 2 * config.target_count)  # of the robots, of the targets
-        self._num_numbers = self._ends[1] + 3 * config.obstacle_count
-        self.record_bytes = _NUMBER.itemsize * self._num_numbers
+        counts = (3 * num, 2 * config.target_count, 3 * config.obstacle_count)
+        self._ends = tuple(accumulate(counts))  # of robots, targets, obstacles
+        self.record_bytes = _NUMBER.itemsize * (self._ends[-1] + bool(config.pixel_noise))
         self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
         self._views = AnalyticViews(config) if config.renderer == "analytic" else None
 
     def __repr__(self) -> str:
         return f"SceneCodec(record_bytes={self.record_bytes})"
 
-    def encode(self, scene: Scene) -> UInt8Array:
+    def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
         num = len(self._order)
         leading = scene.robots.shape[:-2]
-        numbers = np.empty((*leading, num, self._num_numbers), _NUMBER)
-        numbers[..., : 3 * num] = scene.robots[..., self._order, :].reshape(*leading, num, 3 * num)
-        start, end = self._ends
-        numbers[..., start:end] = scene.targets.reshape(*leading, 1, end - start)
-        rest = self._num_numbers - end
-        numbers[..., end:] = scene.obstacles.reshape(*leading, 1, rest)
-        return numbers.view(np.uint8)
+        records = np.empty((*leading, num, self.record_bytes), np.uint8)
+        numbers = records.view(_NUMBER)
+        robots, targets, obstacles = self._ends
+        poses = scene.robots[..., self._order, :]
+        numbers[..., :robots] = poses.reshape(*leading, num, robots)
+        numbers[..., robots:targets] = scene.targets.reshape(*leading, 1, targets - robots)
+        numbers[..., targets:obstacles] = scene.obstacles.reshape(*leading, 1, obstacles - targets)
+        if self._config.pixel_noise:
+            records.view(_SEED)[..., -1] = 0 if noise_seeds is None else noise_seeds
+        return records
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
         pictures = _pictures(records, self.record_bytes, self._config.view_px, out)
@@ -71,10 +81,12 @@ class SceneCodec:
         else:
             for view, scene in zip(views, scenes, strict=True):
                 view[:] = literal_views(self._scene_of(scene), self._config)[0]
+        if self._config.pixel_noise:
+            add_noise(views, flat.view(_SEED)[:, -1], self._config.pixel_noise)
         return pictures
 
     def _scene_of(self, numbers: Float32Array) -> Scene:
-        robots, targets, obstacles = np.split(numbers.astype(np.float64), self._ends)
+        robots, targets, obstacles = np.split(numbers.astype(np.float64), self._ends)[:3]
         return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2), obstacles.reshape(-1, 3))
 
 
@@ -89,8 +101,8 @@ class FrameCodec:
     def __repr__(self) -> str:
         return f"FrameCodec(record_bytes={self.record_bytes})"
 
-    def encode(self, scene: Scene) -> UInt8Array:
-        records = self._scenes.encode(scene)
+    def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
+        records = self._scenes.encode(scene, noise_seeds)
         return self._scenes.decode(records).reshape(*records.shape[:-1], self.record_bytes)
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:

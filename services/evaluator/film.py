@@ -1,6 +1,11 @@
-"""Evaluation episodes as pictures: the arena beside what its robots see."""
+"""Evaluation episodes as pictures: the arena beside what its robots see.
+
+Invariants: drawn from poses, so that noise is like the noise they saw, and no frame is dropped.
+"""
 
 from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from common.arena import Scene, draw_arena, make_codec
 from common.config import ArenaConfig
@@ -19,7 +24,8 @@ def film_frames(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Itera
         last = len(episode.robots) - 1
         for frame, robots in enumerate(episode.robots):
             scene = Scene(robots, episode.targets, episode.obstacles)
-            views = codec.decode(codec.encode(scene))
+            noise_seeds = np.arange(len(robots), dtype=np.uint32) + frame * len(robots)
+            views = codec.decode(codec.encode(scene, noise_seeds))
             ending = f"   {episode.outcome.value}" if frame == last else ""
             caption = f"episode {number} of {len(episodes)}   frame {frame}{ending}"
             picture = compose_frame(draw_arena(scene, config, _ARENA_PX), views, caption)
