@@ -21,7 +21,8 @@ from common.arena import (
     starts,
 )
 from common.arena.controllers import controller
-from common.config import ArenaConfig
+from common.arena.obstacles import room_px
+from common.config import ArenaConfig, load_config
 from common.errors import ConfigError
 from common.trajectory import Outcome, StepType
 
@@ -210,6 +211,24 @@ def test_success_does_not_wait_for_a_robot_that_failed() -> None:
         assert outcome is (Outcome.SUCCESS if second_stands else None)
         seen.add(outcome)
     assert len(seen) == 2
+
+
+@pytest.mark.parametrize("num_robots", [1, 4, 10])
+def test_the_hard_preset_can_be_played(num_robots: int) -> None:
+    given = {"arena.num_robots": str(num_robots), "arena.num_targets": str(num_robots + 2)}
+    config = load_config("hard", given, environ={}).arena
+    batch = ArenaBatch(config, [np.random.default_rng(seed) for seed in range(4)])
+    codec = make_codec(config)
+    rng = np.random.default_rng(1)
+    ended = list(range(4))
+    for _ in range(150):
+        for index in ended:
+            batch.reset(index)
+            scene = batch.scene(index)
+            assert (room_px(config, scene.robots[:, :2], scene.obstacles) >= 0).all()
+        steps = batch.step(rng.integers(0, 3, (4, num_robots)))
+        assert codec.decode(steps.records).shape == (4, num_robots, 60, 60)
+        ended = [index for index, outcome in enumerate(steps.outcomes) if outcome is not None]
 
 
 def fingerprint(physics: str) -> str:
