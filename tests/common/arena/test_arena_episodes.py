@@ -267,17 +267,27 @@ def test_a_seed_gives_the_same_play_in_another_process_and_by_pymunk() -> None:
 @given(
     seed=st.integers(0, 2**32 - 1),
     flags=st.tuples(st.booleans(), st.booleans(), st.booleans()),
+    world=st.sampled_from(
+        [
+            {"size_px": 270},
+            {"size_px": 400, "target_layout": "random", "num_targets": 4, "num_obstacles": 2},
+        ]
+    ),
 )
-def test_a_mapped_arena_pays_and_ends_the_same(seed: int, flags: tuple[bool, bool, bool]) -> None:
+def test_a_mapped_arena_pays_and_ends_the_same(
+    seed: int, flags: tuple[bool, bool, bool], world: dict[str, object]
+) -> None:
     symmetry = Symmetry(*flags)
-    config = ArenaConfig(num_robots=3, size_px=270, max_collisions=20, max_frames=60)
+    config = ArenaConfig.model_validate(
+        {"num_robots": 3, "max_collisions": 20, "max_frames": 60, **world}
+    )
     rng = np.random.default_rng(seed)
     one, other = Arena(config, rng), Arena(config, rng)
     one.reset()
     scene = one.scene
     mapped = symmetry.apply_to_scene(scene, config.size_px)
-    one.reset(Start(scene.robots, scene.targets))
-    other.reset(Start(mapped.robots, mapped.targets))
+    one.reset(Start(scene.robots, scene.targets, scene.obstacles))
+    other.reset(Start(mapped.robots, mapped.targets, mapped.obstacles))
     running = True
     while running:
         moves = rng.integers(0, 3, 3, dtype=np.uint8)
