@@ -49,7 +49,7 @@ class TimeStep:
     rewards: Float32Array  # [K], zero at FIRST
     discount: float  # 0 after a termination (success, failure), else 1; gamma is the agent's
     collided: BoolArray  # [K], whose move was undone in this frame
-    hit_wall: BoolArray  # [K], of those that collided, whose way led beyond a wall
+    hit_wall: BoolArray  # [K], of those that collided, whose way led into a wall or obstacle
     outcome: Outcome | None = None  # set at LAST
 
     @property

@@ -62,7 +62,7 @@ def obstacles_for(
     """
     given = given_obstacles(config)
     if not config.num_obstacles:
-        return given
+        return given.copy()
     radius = config.obstacle_radius_px
     passage = 2 * config.robot_radius_px + _PASSAGE_PX
     low, high = reachable_px(config)

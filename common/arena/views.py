@@ -79,12 +79,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
             _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall)
         else:
             _walls_upright(view, own_x, own_y, scale, wall)
-        for ax, ay, bx, by, half in inner_walls:
-            length = math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
-            dx, dy = (bx - ax) / length, (by - ay) / length
-            x, y = _map(ax - own_x, ay - own_y, c, s, scale, size)
-            across, along = c * dx - s * dy, s * dx + c * dy
-            _bar(view, cover, x, y, across, along, 0.0, length * scale, half * scale, WALL_GREY)
+        _inner_walls(view, cover, own_x, own_y, c, s, scale, inner_walls)
         for j in range(obstacles, obstacles + 3 * num_obstacles, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
             _disc(view, cover, x, y, np.float64(scene[j + 2]) * scale, OBSTACLE_GREY)
@@ -148,6 +143,16 @@ def _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall):  # type: ignor
         _bar(view, cover, x, y, c, s, 0.0, length, width, WALL_GREY)
         x, y = _map(at - own_x, inner - own_y, c, s, scale, size)
         _bar(view, cover, x, y, -s, c, 0.0, short, width, WALL_GREY)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _inner_walls(view, cover, own_x, own_y, c, s, scale, walls):  # type: ignore[no-untyped-def]
+    for ax, ay, bx, by, half in walls:
+        length = math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
+        dx, dy = (bx - ax) / length, (by - ay) / length
+        x, y = _map(ax - own_x, ay - own_y, c, s, scale, view.shape[0])
+        across, along = c * dx - s * dy, s * dx + c * dy
+        _bar(view, cover, x, y, across, along, 0.0, length * scale, half * scale, WALL_GREY)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
