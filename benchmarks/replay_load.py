@@ -1,0 +1,108 @@
+"""Load for a replay service: a process that inserts counting chunks, or one that samples them.
+
+`python -m benchmarks.replay_load writer|sampler --run NAME --connect ENDPOINT --config FILE` goes
+on until it is asked to stop, whatever becomes of the service. A counting chunk is a pure function
+of its actor and sequence, so that whoever finds it again knows what should be in it. A writer
+notes each acknowledgement in `--out`, a line each: sequence, transitions replay has accepted by
+then, and whether it had the chunk before; at the end of its file, the word `done`.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from common.config import Config, TransportConfig, load_config
+from common.keys import Keys
+from common.process import StopSignal
+from common.trajectory import Chunk, Priorities, Samples
+from common.transport import Session
+from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
+
+_WARN_S = 60.0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("role", choices=("writer", "sampler"))
+    parser.add_argument("--run", required=True)
+    parser.add_argument("--connect", required=True)
+    parser.add_argument("--config", required=True)
+    parser.add_argument("--actor", default="actor-0")
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    config, stop = load_config(arguments.config, environ={}), StopSignal().listen()
+    transport = TransportConfig(connect=(arguments.connect,), timeout_s=config.transport.timeout_s)
+    with Session(transport) as session:
+        if arguments.role == "writer":
+            write(config, session, Keys(arguments.run), arguments.actor, arguments.out, stop)
+        else:
+            sample(config, session, Keys(arguments.run), stop)
+    return 0
+
+
+def write(
+    config: Config, session: Session, keys: Keys, actor: str, out: Path, stop: StopSignal
+) -> None:
+    """Insert one chunk after the other; each is asked for until it is acknowledged."""
+    writer, incarnation, sequence = ReplayWriter(session, keys, _WARN_S, stop), time.time_ns(), 0
+    with out.open("w", encoding="utf-8", buffering=1) as acknowledged:
+        while not stop.is_set():
+            reply = writer.insert(counting_chunk(config, actor, incarnation, sequence))
+            if reply is None:
+                break
+            acknowledged.write(f"{sequence} {reply.inserts} {reply.duplicate:d}\n")
+            sequence += 1
+        acknowledged.write("done\n")
+
+
+def sample(config: Config, session: Session, keys: Keys, stop: StopSignal) -> None:
+    """Draw mini-batches, look whether they are whole, and give them new priorities."""
+    reader = ReplayReader(session, keys, config.learner.batch_size, 2, _WARN_S, stop)
+    writer = PriorityWriter(session, keys)
+    rng = np.random.default_rng(0)
+    while (samples := reader.sample()) is not None:
+        check_samples(config, samples)
+        errors = rng.lognormal(0, 1, len(samples)).astype(np.float32)
+        writer.update(Priorities(samples.keys, errors))
+
+
+def counting_chunk(config: Config, actor: str, incarnation: int, sequence: int) -> Chunk:
+    """Rewards count an actor's transitions, records repeat the count of their row."""
+    length, tail = config.actor.chunk_length, config.arena.stack - 1 + config.agent.n_step
+    first = sequence * length
+    rows = (first + np.arange(length + tail)).astype("<u4")
+    counts = np.tile(rows[:, None], config.arena.record_bytes // 4)
+    return Chunk(
+        actor=actor,
+        incarnation=incarnation,
+        sequence=sequence,
+        weights_version=sequence,
+        records=counts.view(np.uint8),
+        actions=((first + np.arange(length)) % 3).astype(np.uint8),
+        rewards=((first + np.arange(length)) % 2**24).astype(np.float32),  # exact up to there
+        discounts=np.full(length, 0.97, np.float32),
+        bootstrap_offsets=np.full(length, config.agent.n_step, np.uint8),
+        priorities=np.ones(length, np.float32),
+    )
+
+
+def check_samples(config: Config, samples: Samples) -> None:
+    """Raise AssertionError where records, rewards and versions of a transition do not fit."""
+    counts = samples.records.view("<u4")
+    first = samples.weights_versions * config.actor.chunk_length
+    window = counts[:, :1, :1] + np.arange(counts.shape[1])[:, None]
+    now = counts[:, 0, 0].astype(np.int64)
+    if not (
+        (counts == window).all()
+        and (samples.rewards == now % 2**24).all()
+        and (samples.actions == now % 3).all()
+        and ((now >= first) & (now < first + config.actor.chunk_length)).all()
+    ):
+        raise AssertionError("a sampled transition is torn or misplaced")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
