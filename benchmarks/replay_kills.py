@@ -225,6 +225,7 @@ def compare(config: Config, contents: Contents, folder: Path) -> dict[str, Any]:
 
     lost: acknowledged, among the transitions that the table has not replaced, and not there.
     moved: there under another key than was said, or not as it was sent. doubled: there twice.
+    placed: of the acknowledged, those whose key was said.
     """
     assert contents.rebuilt is not None
     oldest = contents.rebuilt.table.first_key
@@ -232,20 +233,19 @@ def compare(config: Config, contents: Contents, folder: Path) -> dict[str, Any]:
         (chunk.actor, chunk.sequence): (key, chunk)
         for key, chunk in zip(contents.keys, contents.chunks, strict=True)
     }
-    lost, moved, acknowledged, repeats, unasked = [], [], 0, 0, 0
+    lost, moved, acknowledged, placed, unasked = [], [], 0, 0, 0
     for actor in WRITERS:
         *lines, last = (folder / f"{actor}.acknowledged").read_text("utf-8").splitlines()
         assert last == "done"
-        position = 0
+        not_before = 0  # each comes after the one before it
         for line in lines:
-            sequence, inserts, repeated = (int(word) for word in line.split())
-            acknowledged, repeats = acknowledged + 1, repeats + repeated
-            # Of a repeat only this is known: it came after the one before it.
-            position = position if repeated else inserts - config.actor.chunk_length
+            sequence, key = (int(word) for word in line.split())
+            acknowledged, placed = acknowledged + 1, placed + (key >= 0)
+            not_before = max(not_before, key)
             found = there.get((actor, sequence))
             if found is None:
-                lost += [f"{actor} {sequence}"] * (position >= oldest)
-            elif not (repeated or found[0] == position) or not _as_sent(config, found[1]):
+                lost += [f"{actor} {sequence}"] * (not_before >= oldest)
+            elif key not in (-1, found[0]) or not _as_sent(config, found[1]):
                 moved.append(f"{actor} {sequence}")
         newest = max(s for a, s in there if a == actor)
         unasked += newest - (len(lines) - 1)
@@ -253,11 +253,11 @@ def compare(config: Config, contents: Contents, folder: Path) -> dict[str, Any]:
     return {
         "acknowledged": acknowledged,
         "transitions": acknowledged * config.actor.chunk_length,
-        "repeats": repeats,
+        "placed": placed,
         "lost": lost[:20],
         "doubled": files.duplicate_chunks + len(contents.chunks) - len(there),
         "moved": moved[:20],
-        "stored_unacknowledged": unasked,  # at most one a writer
+        "stored_unacknowledged": unasked,  # at most one request of each writer
         "in_the_log": len(contents.chunks),
         "table_size": len(contents.rebuilt.table),
         "corrupt_records": files.corrupt_records,

@@ -3,11 +3,13 @@
 `python -m benchmarks.replay_load writer|sampler --run NAME --connect ENDPOINT --config FILE` goes
 on until it is asked to stop, whatever becomes of the service. A counting chunk is a pure function
 of its actor and sequence, so that whoever finds it again knows what should be in it. A writer
-notes each acknowledgement in `--out`, a line each: sequence, transitions replay has accepted by
-then, and whether it had the chunk before; at the end of its file, the word `done`.
+sends up to six at a time, as an actor's spool does, and notes each acknowledged one in `--out`, a
+line each: its sequence, and the key of its first transition, or -1 where the acknowledgement does
+not tell (of a request's last chunk it does, unless replay had it before); in the end, `done`.
 """
 
 import argparse
+import random
 import sys
 import time
 from pathlib import Path
@@ -22,6 +24,7 @@ from common.transport import Session
 from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
 
 _WARN_S = 60.0
+_MOST_CHUNKS = 6  # of one request
 
 
 def main() -> int:
@@ -46,22 +49,27 @@ def main() -> int:
 def write(
     config: Config, session: Session, keys: Keys, actor: str, out: Path, stop: StopSignal
 ) -> None:
-    """Insert one chunk after the other; each is asked for until it is acknowledged."""
+    """Insert chunk after chunk, some together; they are sent until they are acknowledged."""
     writer, incarnation, sequence = ReplayWriter(session, keys, _WARN_S, stop), time.time_ns(), 0
+    rng = random.Random(actor)
     with out.open("w", encoding="utf-8", buffering=1) as acknowledged:
         while not stop.is_set():
-            reply = writer.insert(counting_chunk(config, actor, incarnation, sequence))
+            numbers = range(sequence, sequence + rng.randint(1, _MOST_CHUNKS))
+            chunks = [counting_chunk(config, actor, incarnation, n) for n in numbers]
+            reply = writer.insert(chunks)
             if reply is None:
                 break
-            acknowledged.write(f"{sequence} {reply.inserts} {reply.duplicate:d}\n")
-            sequence += 1
+            key = -1 if reply.duplicate else reply.inserts - config.actor.chunk_length
+            acknowledged.writelines(f"{n} -1\n" for n in numbers[:-1])
+            acknowledged.write(f"{numbers[-1]} {key}\n")
+            sequence = numbers.stop
         acknowledged.write("done\n")
 
 
 def sample(config: Config, session: Session, keys: Keys, stop: StopSignal) -> None:
     """Draw mini-batches, look whether they are whole, and give them new priorities."""
-    reader = ReplayReader(session, keys, config.learner.batch_size, 2, _WARN_S, stop)
-    writer = PriorityWriter(session, keys)
+    reader = ReplayReader(session, keys, config.learner.batch_size, 2, 2, _WARN_S, stop)
+    writer = PriorityWriter(session, keys, stop)
     rng = np.random.default_rng(0)
     while (samples := reader.sample()) is not None:
         check_samples(config, samples)
