@@ -2,8 +2,9 @@
 
 `python -m benchmarks.fuzz_wire --minutes 10` runs libFuzzer (by Atheris, `pip install atheris`) in
 a process of its own, begins with a valid message of each class, and prints one line of JSON:
-executions, executions/s, coverage (edges of common/wire.py's bytecode, and features), findings.
-What is taken must also encode to the same again. Exit code 1 where there is a finding.
+executions, executions/s, coverage (edges of the bytecode of common/wire.py and framing.py, and
+features), findings. Sets of messages are taken apart too. What is taken must also encode to the
+same again. Exit code 1 where there is a finding.
 """
 
 import argparse
@@ -14,11 +15,14 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgpack
 import numpy as np
 
 from benchmarks.machine import emit
+from common.errors import WireError
+from common.framing import join_map, join_set, split_map
 
 _DONE = re.compile(r"cov: (\d+) ft: (\d+) corp: (\d+)")
 _STAT = re.compile(r"^stat::(\w+):\s+(\d+)", re.M)
@@ -54,6 +58,8 @@ _ODD = (
     {},
     [[], b"\0"],
 )
+
+_PLACES = (0, 64, 128, 1, -64, 2**32, 2**64 - 1)
 
 
 def main() -> int:
@@ -105,12 +111,20 @@ def watch(folder: Path, minutes: float, seed: int) -> dict[str, Any]:
 
 
 def examples() -> list[bytes]:
-    """A valid message of every class, its class's number before it."""
+    """A valid message of every class, its class's number before it, and sets of chunks.
+
+    Each once with its arrays in the map and once with them after it.
+    """
     from common import wire
+    from common.trajectory import Chunk
 
     found = []
-    for number, cls in enumerate(wire._SCHEMAS):
-        found.append(bytes([number]) + wire.encode(example(cls)))
+    for large_bytes in (wire._LARGE_BYTES, 1):
+        with mock.patch.object(wire, "_LARGE_BYTES", large_bytes):
+            for number, cls in enumerate(wire._SCHEMAS):
+                found.append(bytes([number]) + wire.encode(example(cls)))
+            chunks = [wire.encode_parts(example(Chunk))] * 2
+            found.append(bytes([len(wire._SCHEMAS)]) + b"".join(join_set(chunks)))
     return found
 
 
@@ -150,23 +164,28 @@ def fuzz(arguments: list[str]) -> int:
         import atheris
     except ImportError:
         raise SystemExit("fuzz_wire needs Atheris: pip install atheris") from None
-    with atheris.instrument_imports(include=["common.wire"]):
-        from common import wire
-    from common.errors import WireError
+    for name in ("common.framing", "common.wire"):  # to be read again, with what counts edges
+        sys.modules.pop(name, None)
+    with atheris.instrument_imports(include=["common.framing", "common.wire"]):
+        from common import framing, wire
+    from common.trajectory import Chunk
 
     classes = list(wire._SCHEMAS)
 
     def one(data: bytes) -> None:
         if not data:
             return
-        cls = classes[data[0] % len(classes)]
+        number = data[0] % (len(classes) + 1)
+        cls = Chunk if number == len(classes) else classes[number]
         try:
-            message = wire.decode(cls, data[1:])
+            parts = framing.split_set(data[1:]) if number == len(classes) else [data[1:]]
+            messages = [wire.decode(cls, part) for part in parts]
         except WireError:
             return
-        again = wire.encode(message)
-        if wire.encode(wire.decode(cls, again)) != again:
-            raise AssertionError(f"a {cls.__name__} does not come back as it was")
+        for message in messages:
+            again = wire.encode(message)
+            if wire.encode(wire.decode(cls, again)) != again:
+                raise AssertionError(f"a {cls.__name__} does not come back as it was")
 
     def mutate(data: bytes, max_size: int, seed: int) -> bytes:
         rng = random.Random(seed)
@@ -181,23 +200,26 @@ def fuzz(arguments: list[str]) -> int:
 def structured(data: bytes, rng: random.Random) -> bytes | None:
     """A message with something odd in one place of its map; None where the bytes are no map."""
     try:
-        table = msgpack.unpackb(data[1:], strict_map_key=False)
+        in_map, arrays = split_map(memoryview(data[1:]))
+        table = msgpack.unpackb(in_map, strict_map_key=False)
         if not isinstance(table, dict) or not table:
             return None
         key = rng.choice(list(table))
-        value, kind = table[key], rng.randrange(4)
+        value, kind = table[key], rng.randrange(5)
         if kind == 0:
             table[key] = rng.choice(_ODD)
         elif kind == 1 and isinstance(value, list) and len(value) == 2:
             table[key] = [rng.choice(_SHAPES), value[1]]
         elif kind == 2 and isinstance(value, list) and len(value) == 2:
             table[key] = [value[0], rng.randbytes(rng.choice((0, 1, 2, 4, 8, 12, 16)))]
+        elif kind == 3 and isinstance(value, list) and len(value) == 2:
+            table[key] = [value[0], rng.choice(_PLACES)]
         else:
             table.pop(key)
-        packed: bytes = msgpack.packb(table)
-    except (ValueError, TypeError, OverflowError, IndexError, msgpack.UnpackException):
+        parts = join_map(msgpack.packb(table), [arrays] if len(arrays) else [])
+    except (ValueError, TypeError, OverflowError, IndexError, msgpack.UnpackException, WireError):
         return None
-    return data[:1] + packed
+    return data[:1] + b"".join(parts)
 
 
 if __name__ == "__main__":
