@@ -1,10 +1,10 @@
 """A real replay service is sent bad messages on all its keys, and a good one among each fifty.
 
 `python -m benchmarks.bad_messages --count 100000` starts a replay process, sends it malformed,
-truncated, flipped, spliced, foreign, ill-fitting and oversized messages over Zenoh, and prints one
-line of JSON: how many of each kind were refused, that all were counted, the reasons, messages/s,
-and the memory of the process (VmRSS) on the way. tests/system/test_system_bad_messages.py sends
-a few thousand.
+truncated, flipped, spliced, foreign, ill-fitting and oversized messages over Zenoh, also with
+their arrays after the map, and in sets. It prints one line of JSON: how many of each kind were
+refused, that all were counted, the reasons, messages/s, and the memory of the process (VmRSS) on
+the way. tests/system/test_system_bad_messages.py sends a few thousand.
 """
 
 import argparse
@@ -16,13 +16,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgpack
 import numpy as np
 
 from benchmarks.machine import emit
+from common import wire
 from common.config import Config, TransportConfig, load_config, to_toml
 from common.errors import DeadlineError, HeldError, RefusedError, WireError
+from common.framing import join_set, split_set
 from common.keys import Keys
 from common.trajectory import Chunk, Priorities, Stats
 from common.transport import PendingReply, Session, free_endpoint
@@ -46,7 +49,7 @@ CONFIG = load_config(
 )
 KINDS = (
     *("random", "empty", "truncated", "flipped", "spliced", "longer", "foreign", "newer"),
-    *("misfit", "odd", "nested", "oversized"),
+    *("misfit", "odd", "nested", "oversized", "apart", "set"),
 )
 
 
@@ -219,11 +222,16 @@ def bad(cls: type, kind: str, rng: random.Random) -> bytes:
 def could_be_taken(cls: type, payload: bytes) -> bool:
     """Whether the change did no harm, or none that can be told."""
     try:
-        message: Any = decode(cls, payload)
+        parts = split_set(payload) if cls is Chunk else [payload]
+        return all(_fits(decode(cls, part)) for part in parts)
     except WireError:
         return False
+
+
+def _fits(message: Any) -> bool:
+    """Whether a sound message is of the run's arena, agent and batch size."""
     if isinstance(message, SampleRequest):
-        return 1 <= message.batch_size <= CONFIG.learner.batch_size
+        return 1 <= message.batch_size <= CONFIG.learner.sample_size
     if isinstance(message, Chunk):
         due = example(Chunk).records.shape[1], CONFIG.arena.stack - 1 + CONFIG.agent.n_step
         given = message.records.shape[1], len(message.records) - len(message)
@@ -233,10 +241,28 @@ def could_be_taken(cls: type, payload: bytes) -> bool:
 
 
 def _flipped(cls: type, rng: random.Random) -> bytes:
-    data = bytearray(encode(example(cls)))
+    return _flip(encode(example(cls)), rng)
+
+
+def _flip(message: bytes, rng: random.Random) -> bytes:
+    data = bytearray(message)
     for _ in range(rng.randint(1, 8)):
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
     return bytes(data)
+
+
+def _apart(cls: type, rng: random.Random) -> bytes:
+    """Arrays after the map, and something of it flipped or away."""
+    with mock.patch.object(wire, "_LARGE_BYTES", 1):
+        data = encode(example(cls))
+    return _flip(data, rng) if rng.random() < 0.5 else data[: rng.randrange(len(data))]
+
+
+def _set(cls: type, rng: random.Random) -> bytes:
+    """One of several is bad, or their head lies."""
+    good, other = [encode(example(cls, 2**40))], [_flip(encode(example(cls)), rng)]
+    message = b"".join(join_set([good, other] if rng.random() < 0.5 else [good, good]))
+    return message if rng.random() < 0.5 else _flip(message[:16], rng) + message[16:]
 
 
 def _spliced(cls: type, rng: random.Random) -> bytes:
@@ -257,7 +283,7 @@ def _misfit(cls: type, rng: random.Random) -> bytes:
     """Well-formed, and of another arena, agent or batch size."""
     message = example(cls)
     if cls is SampleRequest:
-        return encode(SampleRequest(rng.choice((0, -1, CONFIG.learner.batch_size + 1, 2**62))))
+        return encode(SampleRequest(rng.choice((0, -1, CONFIG.learner.sample_size + 1, 2**62))))
     if cls is Priorities:
         bad_one = np.float32(rng.choice((-1.0, np.nan, np.inf)))
         return encode(dataclasses.replace(message, priorities=np.full(32, bad_one)))
@@ -299,6 +325,8 @@ _MAKE: dict[str, Callable[[type, random.Random], bytes]] = {
     "newer": lambda cls, rng: encode(example(cls)).replace(b"/1", b"/2", 1),
     "misfit": _misfit,
     "odd": _odd,
+    "apart": _apart,
+    "set": _set,
     "nested": lambda cls, rng: b"\x91" * rng.randint(1, 100_000) + b"\xc0",
 }
 
