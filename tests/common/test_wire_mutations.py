@@ -5,12 +5,15 @@ of their structure. `benchmarks/fuzz_wire.py` does the same for as long as one l
 """
 
 from typing import Any
+from unittest import mock
 
 import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common import wire
 from common.errors import WireError
+from common.framing import join_set, split_set
 from common.wire import decode, encode
 from tests.common.test_wire import CLASSES, MESSAGES
 
@@ -102,3 +105,36 @@ def test_odd_in_one_place(message: Any, data: st.DataObject) -> None:
         place, key = inner, data.draw(st.sampled_from(keys))
     place[key] = data.draw(ODD)
     decode_or_refuse(type(message), msgpack.packb(table))
+
+
+def apart(message: Any) -> bytes:
+    """A message whose arrays follow its map, however small."""
+    with mock.patch.object(wire, "_LARGE_BYTES", 1):
+        return encode(message)
+
+
+@settings(max_examples=300)
+@given(message=MESSAGES, data=st.data())
+def test_arrays_after_the_map_flipped_or_cut(message: Any, data: st.DataObject) -> None:
+    damaged = bytearray(apart(message))
+    for bit in data.draw(st.lists(st.integers(0, 8 * len(damaged) - 1), max_size=8)):
+        damaged[bit // 8] ^= 1 << bit % 8
+    cut = data.draw(st.integers(0, len(damaged)))
+    decode_or_refuse(type(message), bytes(damaged[:cut]))
+
+
+@settings(max_examples=300)
+@given(messages=st.lists(MESSAGES, min_size=2, max_size=4), data=st.data())
+def test_a_set_flipped_or_cut(messages: list[Any], data: st.DataObject) -> None:
+    """It falls apart into messages, sound ones or not, or is refused."""
+    damaged = bytearray(b"".join(join_set([[apart(message)] for message in messages])))
+    head = 8 * min(len(damaged), 24)
+    for bit in data.draw(st.lists(st.integers(0, head - 1), max_size=4)):
+        damaged[bit // 8] ^= 1 << bit % 8
+    cut = data.draw(st.sampled_from([0, 3, 7, 8, 9, 12, 63, 64, 65, len(damaged)]))
+    try:
+        parts = split_set(bytes(damaged[:cut]))
+    except WireError:
+        return
+    for part in parts:
+        decode_or_refuse(type(messages[0]), bytes(part))
