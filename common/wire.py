@@ -173,7 +173,7 @@ def decode(cls: type[M], data: Part) -> M:
     values, end = {}, 0
     for name, read in readers.items():
         value = table[name]
-        is_large = _follows(value)
+        is_large = name in _ARRAYS[cls] and _follows(value)
         try:
             if is_large:
                 value = [value[0], _begin(arrays, value[1], padded(end))]
@@ -302,3 +302,7 @@ def _exact(expected: type) -> Callable[[Any], Any]:
 
 
 _READERS = {cls: _readers_of(cls) for cls in _SCHEMAS}
+_ARRAYS = {
+    cls: {name for name, hint in get_type_hints(cls).items() if get_origin(hint) is np.ndarray}
+    for cls in _SCHEMAS
+}

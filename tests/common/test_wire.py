@@ -429,6 +429,16 @@ def test_the_malformed_is_refused_with_its_reason(name: str) -> None:
     assert "\n" not in str(refused.value)
 
 
+def test_whole_numbers_are_numbers() -> None:
+    """Of a peer in another language, in a pair that is no array too."""
+    shares = dict.fromkeys(("success_rate", "collision_rate", "timeout_rate"), 0.5)
+    rest = {f.name: 1 for f in dataclasses.fields(Evaluation)}
+    sent = {**rest, **shares, "schema": "evaluation/1", "worker": "e", "success_interval": [0, 1]}
+    found = decode(Evaluation, msgpack.packb(sent))
+    assert found.success_interval == (0.0, 1.0)
+    assert isinstance(found.mean_score, float)
+
+
 def test_the_unchanged_message_is_taken() -> None:
     assert_same(decode(Chunk, changed(CHUNK)), CHUNK)
 
