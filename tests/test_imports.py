@@ -19,6 +19,7 @@ FILES = sorted(
 # Where a library may be imported: a folder with all in it, or one file.
 PLACES = {
     "zenoh": ("common/transport",),
+    "lz4": ("common/transport",),
     "msgpack": ("common/wire.py",),
     "pymunk": ("common/arena",),
     "cv2": ("common/arena",),

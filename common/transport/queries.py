@@ -7,9 +7,12 @@ A large message between processes of one host goes through a slot (`slots.py`); 
 
     attachment of a request   "slot ADDRESS"               a large answer may be put there
                               "slot ADDRESS START LENGTH"  and the request is there already
+                              "far"                        no slot: you could not open one
     attachment of a reply     "near"                       the slot was opened
                               "near START LENGTH"          and the message is there
                               "far: REASON"                it could not be opened
+
+Between peers that are far from each other a large message is compressed (`compression.py`).
 """
 
 import contextlib
@@ -22,12 +25,21 @@ from typing import Any
 
 import zenoh
 
-from common.errors import DeadlineError, HeldError, RefusedError, SlotError, TransportError
+from common.errors import (
+    DeadlineError,
+    HeldError,
+    RefusedError,
+    SlotError,
+    TransportError,
+    WireError,
+)
 from common.framing import Part
+from common.transport.compression import compressed, expanded
 from common.transport.slots import LARGE_BYTES, Lender, Slot, Slots, put, room
 
 _HELD = "held: "
 _FAR = "far: "
+_KNOWN_FAR = "far"
 _OFFER = re.compile(r"slot (\S+ \d+ \d+ \S+)(?: (\d{1,12}) (\d{1,12}))?")
 _NEAR = re.compile(r"near(?: (\d{1,12}) (\d{1,12}))?")
 _WAITING = 4  # messages of the largest size that may wait for a server
@@ -37,23 +49,31 @@ _LATE_S = 1.0  # Zenoh ends a query at its own timeout; this more is for a callb
 class Request:
     """A query to be answered once, by `reply`, `refuse` or `hold`."""
 
-    __slots__ = ("_memory", "_near", "_query", "arrived_s", "payload")
+    __slots__ = ("_far", "_memory", "_near", "_query", "arrived_s", "payload")
 
     def __init__(self, query: Any, payload: Part) -> None:
         self._query = query
         self._memory: memoryview | None = None  # that the client lends
         self._near: str | None = None  # what the reply says of it
+        self._far = False  # the client is, and knows compressed messages
         self.payload = payload
         self.arrived_s = time.monotonic()
 
     def open(self, slots: Slots, max_message_bytes: int) -> None:
         """Reach for the slot that the client lends, if it does.
 
-        Raises SlotError where the payload is in a slot that is out of reach.
+        Raises SlotError where the payload is in a slot that is out of reach, WireError where it is
+        compressed and damaged.
         """
+        if isinstance(self.payload, bytes):
+            self.payload = expanded(self.payload, max_message_bytes)
         if self._query.attachment is None:
             return
-        offer = _OFFER.fullmatch(self._query.attachment.to_bytes().decode("ascii", "replace"))
+        said = self._query.attachment.to_bytes().decode("ascii", "replace")
+        self._far = said == _KNOWN_FAR
+        if self._far:
+            return
+        offer = _OFFER.fullmatch(said)
         try:
             if offer is None:
                 raise SlotError("no offer of a slot")
@@ -61,7 +81,7 @@ class Request:
         except SlotError as error:
             if offer is not None and offer[2]:
                 raise
-            self._near = f"{_FAR}{error}"
+            self._near, self._far = f"{_FAR}{error}", True
             return
         self._near = "near"
         if offer[2]:
@@ -81,7 +101,7 @@ class Request:
             place = put(self._memory, parts)
             if place is not None:
                 near, parts = f"near {place[0]} {place[1]}", ()
-        message = b"".join(parts)
+        message = _over_network(parts, far=self._far)
         self._answer(lambda: self._query.reply(self._query.key_expr, message, attachment=near))
 
     def refuse(self, reason: str) -> None:
@@ -148,6 +168,10 @@ class Server:
         except SlotError as error:
             request.cannot_open(str(error))
             return None
+        except WireError as error:
+            self.refused += 1
+            request.refuse(str(error))
+            return None
         return request
 
 
@@ -188,7 +212,8 @@ class PendingReply:
     def result(self) -> Part:
         """The reply's payload, valid until `release`.
 
-        Raises HeldError or RefusedError for a refusal, DeadlineError where no reply came.
+        Raises HeldError or RefusedError for a refusal, DeadlineError where no reply came,
+        WireError where it is compressed and damaged.
         """
         self._ended.wait(max(self._deadline - time.monotonic(), 0.0))
         reply = self._reply
@@ -232,8 +257,7 @@ class PendingReply:
         self.release()
         if len(sample.payload) > self._max_bytes:
             raise RefusedError(f"the answer of {self._whom} exceeds {self._max_bytes} bytes")
-        payload: bytes = sample.payload.to_bytes()
-        return payload
+        return expanded(sample.payload.to_bytes(), self._max_bytes)
 
 
 class Client:
@@ -255,7 +279,8 @@ class Client:
         """
         parts = [payload] if isinstance(payload, Part) else payload
         length = sum(map(len, parts))
-        slot, attachment = self._lend(max(length, reply_bytes)), None
+        slot = self._lend(max(length, reply_bytes))
+        attachment = _KNOWN_FAR if self._lender.near is False else None
         if slot is not None:
             attachment = f"slot {slot.address}"
             if self._lender.near and length >= LARGE_BYTES:
@@ -264,8 +289,9 @@ class Client:
                     attachment, parts = f"{attachment} {place[0]} {place[1]}", ()
         pending = PendingReply(self._whom, self._timeout_s, self._max_bytes, self._lender, slot)
         handler = zenoh.handlers.Callback(pending.offer, pending.end, indirect=False)
+        message = _over_network(parts, far=self._lender.near is False)
         try:
-            self._querier.get(handler, payload=b"".join(parts), attachment=attachment)
+            self._querier.get(handler, payload=message, attachment=attachment)
         except zenoh.ZError as error:
             raise TransportError(f"cannot ask {self._whom}: {error}") from error
         return pending
@@ -275,6 +301,13 @@ class Client:
         if size < LARGE_BYTES and self._lender.near is not None:
             return None
         return self._lender.borrow(size)
+
+
+def _over_network(parts: Sequence[Part], *, far: bool) -> bytes:
+    """What crosses the network; compressed where it is large and goes to another host."""
+    if far and sum(map(len, parts)) >= LARGE_BYTES:
+        return compressed(parts)
+    return b"".join(parts)
 
 
 def _within(memory: memoryview, start: int, length: int, max_bytes: int) -> memoryview:

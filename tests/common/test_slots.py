@@ -13,7 +13,8 @@ import pytest
 
 from common.config import TransportConfig
 from common.errors import DeadlineError, HeldError, SlotError
-from common.transport import Request, Server, Session, free_endpoint
+from common.transport import Request, Server, Session, free_endpoint, queries
+from common.transport.compression import compressed
 from common.transport.slots import LARGE_BYTES, Lender, Slot, Slots, put, room
 from tests.common.test_transport import until_served
 
@@ -192,10 +193,16 @@ def test_a_peer_that_cannot_open_a_slot_is_served_over_the_network(
     monkeypatch.setattr(
         "common.transport.slots._boot_id", iter(["0" * 36, *["1" * 36] * 9]).__next__
     )
+    sent: list[bytes] = []
+    monkeypatch.setattr(
+        queries, "compressed", lambda parts: sent.append(compressed(parts)) or sent[-1]
+    )
     for _ in range(3):
         got, answer, asked = pair.exchange(LARGE, LARGE)
         assert (got, answer) == (LARGE, LARGE)
         assert isinstance(asked.payload, bytes)
+    assert len(sent) == 5  # all but the first request, before which nothing is known
+    assert max(map(len, sent)) < len(LARGE) / 10
     assert caplog.messages == [
         "large messages to and from the peer go over the network: another host"
     ]

@@ -1,0 +1,43 @@
+"""Large messages between hosts, compressed as a whole.
+
+    0xC1 "lz4", length uint32, one LZ4 block
+
+Invariants: a message that is not so marked is itself, and no message of ours begins with the mark;
+nothing is expanded beyond the largest message that is allowed.
+"""
+
+import struct
+from collections.abc import Sequence
+
+import lz4.block
+
+from common.errors import WireError
+from common.framing import Part
+
+_HEAD = struct.Struct("<4sI")
+_MARK = b"\xc1lz4"
+
+
+def compressed(parts: Sequence[Part]) -> bytes:
+    """A message given in parts, as one block."""
+    message = b"".join(parts)
+    block: bytes = lz4.block.compress(message, store_size=False)
+    return _HEAD.pack(_MARK, len(message)) + block
+
+
+def expanded(payload: bytes, max_message_bytes: int) -> bytes:
+    """The message of a payload; raises WireError where it is damaged or too large."""
+    if payload[: len(_MARK)] != _MARK:
+        return payload
+    if len(payload) < _HEAD.size:
+        raise WireError("a compressed message that ends in its head")
+    _, length = _HEAD.unpack_from(payload)
+    if length > max_message_bytes:
+        raise WireError(f"{length} bytes exceed the limit of {max_message_bytes}")
+    try:
+        message: bytes = lz4.block.decompress(payload[_HEAD.size :], uncompressed_size=length)
+    except lz4.block.LZ4BlockError as error:
+        raise WireError("a compressed message that is damaged") from error
+    if len(message) != length:
+        raise WireError(f"a compressed message of {len(message)} bytes, not {length}")
+    return message
