@@ -334,6 +334,9 @@ class LearnerConfig(Section):
     action with it. (ours)"""
     publish_period: Count = 100
     """Learner steps between publications of the weights. (ours)"""
+    publish_precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """Of published weights; half of it halves their bytes, and those who adopt them cast up. The
+    best weights are kept as they were judged. (ours)"""
     checkpoint_period_s: Positive = 60.0
     """(ours)"""
     keep_checkpoints: Count = 3

@@ -1,8 +1,9 @@
 """The paper's action-value network (section 5.1, Fig. 4) and its parameters as bytes.
 
-Invariants: parameters are float32 whatever the precision; the output layers and their sum are
-computed in float32 always (the gap between actions is about 1 % of Q, below what bfloat16
-resolves); the three kinds differ in their streams only; bytes that do not fit are refused.
+Invariants: parameters are float32 whatever precision they are computed or sent in; the output
+layers and their sum are computed in float32 always (the gap between actions is about 1 % of Q,
+below what bfloat16 resolves); the three kinds differ in their streams only; bytes that do not
+fit are refused.
 
 Shapes: B = states of a batch, S = pictures stacked in a state, V = width of a picture in px.
 """
@@ -26,6 +27,7 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 HIDDEN_UNITS: Final = 512
 FORMAT_VERSION: Final = 1
+SENT_AS: Final = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _METADATA_KEY: Final = "mrcdrl"  # one JSON text: safetensors does not keep an order of several
 _WHITE: Final = 255.0
 _OUTPUTS: Final = ("value.", "advantage.", "action_value.")  # float32 always
@@ -147,13 +149,14 @@ def _stream(features: Tensor, operands: Operands, hidden: str, output: str) -> T
     return functional.linear(x, operands[f"{output}.weight"], operands[f"{output}.bias"])
 
 
-def weights_to_bytes(network: QNetwork) -> bytes:
-    """The parameters as safetensors: float32 by name, with what they belong to in the header.
+def weights_to_bytes(network: QNetwork, dtype: torch.dtype = torch.float32) -> bytes:
+    """The parameters as safetensors: by name, with what they belong to in the header.
 
-    Raises CheckpointError if a value is not finite: weights that diverged are handed to nobody.
+    dtype: one of SENT_AS; all but float32 round. Raises CheckpointError if a value is not finite,
+    or not once it is rounded: weights that diverged are handed to nobody.
     """
     arrays = {
-        name: parameter.detach().to("cpu", torch.float32).contiguous()
+        name: parameter.detach().to("cpu", dtype).contiguous()
         for name, parameter in network.state_dict().items()
     }
     _check_finite(arrays)
@@ -161,7 +164,7 @@ def weights_to_bytes(network: QNetwork) -> bytes:
 
 
 def load_weights(network: QNetwork, payload: bytes) -> None:
-    """Set the network's parameters in place.
+    """Set the network's parameters in place, cast up where they were sent in half precision.
 
     Raises CheckpointError, leaving the network as it was, if the payload is unreadable, belongs
     to another kind or shape of network, or holds a value that is not finite.
@@ -176,12 +179,14 @@ def load_weights(network: QNetwork, payload: bytes) -> None:
     if odd := sorted(own.keys() ^ arrays.keys()):
         where = "lack" if odd[0] in own else "have an unknown"
         raise CheckpointError(f"weights {where} parameter {odd[0]!r}")
+    sent_as = arrays[next(iter(own))].dtype
+    dtype = sent_as if sent_as in SENT_AS.values() else torch.float32
     for name, parameter in own.items():
         array = arrays[name]
-        if array.dtype != torch.float32 or array.shape != parameter.shape:
+        if array.dtype != dtype or array.shape != parameter.shape:
             raise CheckpointError(
                 f"weights: {name} is {array.dtype} {list(array.shape)}, "
-                f"not torch.float32 {list(parameter.shape)}"
+                f"not {dtype} {list(parameter.shape)}"
             )
     _check_finite(arrays)
     network.load_state_dict(arrays)

@@ -16,6 +16,7 @@ from torch import Tensor
 from common.config import AgentConfig, LearnerConfig
 from common.errors import CheckpointError, ConfigError
 from common.network import (
+    SENT_AS,
     Operands,
     QNetwork,
     load_weights,
@@ -45,7 +46,7 @@ class LearnerState:
     """All that a learner needs to go on, ready to be written."""
 
     learner_step: int
-    model: bytes  # weights, as published
+    model: bytes  # weights
     target: bytes  # weights
     optimizer: bytes  # safetensors: float32 by "<parameter>:<moment>"
     rng_state: dict[str, Any]  # of the symmetries' generator, as JSON takes it
@@ -74,6 +75,7 @@ class Learner:
         self.device = resolve_device(learner.device)
         self.learner_step = 0
         self.rng = np.random.default_rng(learner.seed)  # for whoever draws symmetries
+        self._sent_as = SENT_AS[learner.publish_precision]
         dtype = precision(learner.precision, self.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(learner.seed)
@@ -111,7 +113,7 @@ class Learner:
 
     def payload(self) -> bytes:
         """The online parameters for publication; raises CheckpointError if learning diverged."""
-        return weights_to_bytes(self.online)
+        return weights_to_bytes(self.online, self._sent_as)
 
     def state(self) -> LearnerState:
         """A copy of everything; raises CheckpointError if learning diverged."""

@@ -9,6 +9,7 @@ from safetensors.torch import load, save
 
 from common.errors import CheckpointError, ConfigError
 from common.network import (
+    SENT_AS,
     Kind,
     QNetwork,
     feature_size,
@@ -27,6 +28,29 @@ def make_network(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return QNetwork(kind, view_px=view_px, compute_dtype=dtype)
+
+
+@pytest.mark.parametrize("name", ["bfloat16", "float16"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_half_precision_halves_the_bytes_and_is_cast_up(kind: Kind, name: str) -> None:
+    sent, adopted = make_network(kind), make_network(kind, seed=1)
+    payload = weights_to_bytes(sent, SENT_AS[name])
+    assert len(payload) < 0.51 * len(weights_to_bytes(sent))
+    load_weights(adopted, payload)
+    for parameter, exact in zip(adopted.parameters(), sent.parameters(), strict=True):
+        assert parameter.dtype == torch.float32
+        assert torch.equal(parameter, exact.to(SENT_AS[name]).float())
+    again = network_from_bytes(payload)
+    assert weights_to_bytes(again, SENT_AS[name]) == payload, "rounding twice is rounding once"
+
+
+def test_what_half_precision_cannot_hold_is_handed_to_nobody() -> None:
+    network = make_network()
+    with torch.no_grad():
+        network.conv1.bias[0] = 1e6
+    weights_to_bytes(network, torch.bfloat16)
+    with pytest.raises(CheckpointError, match=r"conv1\.bias has values that are not finite"):
+        weights_to_bytes(network, torch.float16)
 
 
 def random_states(count: int, view_px: int = 60) -> torch.Tensor:
