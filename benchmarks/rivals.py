@@ -33,7 +33,7 @@ def main() -> None:
             "evaluator.epsilon": str(epsilon),
         }
         config = load_config("quick", overrides, environ={})
-        judged = Subject(config, None, check_controller(name), Weights(0, 0, 0, b""))
+        judged = Subject(config, None, check_controller(name), Weights.of(0, 0, 0, b""))
         result, measures = judge(judged, arguments.episodes, arguments.seed, lambda _done: None)
         emit(
             {

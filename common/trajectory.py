@@ -8,9 +8,11 @@ return, W = H + 1 + n records that one transition may touch, B = transitions of 
 K = robots of an arena, A = arenas, R = bytes of one observation record.
 """
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,12 +162,21 @@ class PrioritiesReply:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """The network's parameters as published; newer means a larger (epoch, version)."""
+    """The network's parameters as published; newer means a larger (epoch, version).
+
+    Make them by `of`; one whose digest is not the payload's is torn, and the wire refuses it.
+    """
 
     epoch: int  # rises when a run's learner starts from new parameters
     version: int  # rises with every publication, also over restarts
     learner_step: int
-    payload: bytes  # safetensors: float32 arrays by parameter name
+    payload: bytes  # safetensors: arrays by parameter name, all of one precision
+    digest: str  # SHA-256 of the payload, hexadecimal
+
+    @classmethod
+    def of(cls, epoch: int, version: int, learner_step: int, payload: bytes) -> Self:
+        """With the digest of this payload."""
+        return cls(epoch, version, learner_step, payload, hashlib.sha256(payload).hexdigest())
 
     @property
     def order(self) -> tuple[int, int]:

@@ -9,6 +9,7 @@ arrays are copied neither way.
 """
 
 import enum
+import hashlib
 import math
 import types
 from collections.abc import Callable
@@ -102,6 +103,12 @@ def _check_priorities(message: Priorities) -> str | None:
     return None
 
 
+def _check_weights(weights: Weights) -> str | None:
+    if hashlib.sha256(weights.payload).hexdigest() != weights.digest:
+        return "the payload is not what its digest says: torn or altered"
+    return None
+
+
 def _may_be_errors(priorities: Float32Array) -> bool:
     """Whether these are absolute TD errors."""
     return bool(np.isfinite(priorities).all() and (priorities >= 0).all())
@@ -114,7 +121,7 @@ _SCHEMAS: dict[type, str] = {
     Samples: "samples/2",
     Priorities: "priorities/1",
     PrioritiesReply: "priorities_reply/1",
-    Weights: "weights/1",
+    Weights: "weights/2",
     EpisodeSummary: "episode/1",
     Evaluation: "evaluation/1",
     Stats: "stats/1",
@@ -123,6 +130,7 @@ _CHECKS: dict[type, Callable[[Any], str | None]] = {
     Chunk: _check_chunk,
     Samples: _check_samples,
     Priorities: _check_priorities,
+    Weights: _check_weights,
 }
 
 

@@ -182,7 +182,7 @@ def test_example_subscriber_runs(tmp_path: Path) -> None:
     assert found
     example.write_text(found[1], "utf-8")
     endpoint, keys = free_endpoint(), Keys("documented")
-    weights = Weights(7, 3, 100, weights_to_bytes(QNetwork("dqn")))
+    weights = Weights.of(7, 3, 100, weights_to_bytes(QNetwork("dqn")))
     test = Evaluation("e", 7, 3, 100, 2, 10, 0.5, 0.5, 0, (0.2, 0.8), 5, 5, 0, 9, 1, 0, 1)
     with Session(TransportConfig(listen=(endpoint,))) as session:
         process = subprocess.Popen(

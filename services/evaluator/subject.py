@@ -82,7 +82,7 @@ def subject(arguments: argparse.Namespace) -> Subject:
             f"{path} sees {network.stack} pictures of {network.view_px} px, the arena gives "
             f"{config.arena.stack} of {config.arena.view_px} px"
         )
-    weights = Weights(
+    weights = Weights.of(
         epoch=int(manifest.get("weights_epoch", 0)),
         version=int(manifest.get("weights_version", 0)),
         learner_step=int(manifest.get("learner_step", 0)),
@@ -93,7 +93,7 @@ def subject(arguments: argparse.Namespace) -> Subject:
 
 def controlled(name: str, config: Config) -> Subject:
     """A controller in the arena of the configuration; raises ConfigError for an unknown one."""
-    return Subject(config, None, check_controller(name), Weights(0, 0, 0, b""))
+    return Subject(config, None, check_controller(name), Weights.of(0, 0, 0, b""))
 
 
 def weights_path(path: Path) -> Path:

@@ -50,7 +50,7 @@ class Keeper:
         if self.version >= self._reserved:
             self.save()
         self.version += 1
-        return Weights(
+        return Weights.of(
             self.epoch, self.version, self._learner.learner_step, self._learner.payload()
         )
 

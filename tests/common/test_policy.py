@@ -67,7 +67,7 @@ def test_views_and_read_only_pictures_are_taken() -> None:
 
 def test_adopted_weights_are_acted_by() -> None:
     policy, other, observations = Policy(make_network(0)), make_network(1), states(8)
-    policy.adopt(Weights(epoch=2, version=7, learner_step=700, payload=weights_to_bytes(other)))
+    policy.adopt(Weights.of(epoch=2, version=7, learner_step=700, payload=weights_to_bytes(other)))
     assert (policy.weights_epoch, policy.weights_version, policy.learner_step) == (2, 7, 700)
     with torch.no_grad():
         expected = other(torch.from_numpy(observations)).numpy()
@@ -79,7 +79,7 @@ def test_foreign_weights_leave_the_policy_as_it_was() -> None:
     before = policy.q_values(observations)
     foreign = weights_to_bytes(QNetwork("dqn", view_px=VIEW_PX))
     with pytest.raises(CheckpointError, match="kind"):
-        policy.adopt(Weights(epoch=0, version=1, learner_step=1, payload=foreign))
+        policy.adopt(Weights.of(epoch=0, version=1, learner_step=1, payload=foreign))
     assert policy.weights_version == -1
     np.testing.assert_array_equal(policy.q_values(observations), before)
 

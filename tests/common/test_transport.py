@@ -288,7 +288,7 @@ def test_presence_sees_who_is_there_already_who_comes_and_who_goes(network: Netw
 
 
 def weights(epoch: int, version: int) -> Weights:
-    return Weights(epoch, version, learner_step=10 * version, payload=b"p" * 100)
+    return Weights.of(epoch, version, learner_step=10 * version, payload=b"p" * 100)
 
 
 @pytest.fixture

@@ -131,7 +131,7 @@ MESSAGES = st.one_of(
     st.builds(InsertReply, sequence=INTS, duplicate=st.booleans(), inserts=INTS),
     st.builds(SampleRequest, batch_size=INTS),
     st.builds(PrioritiesReply, updated=INTS, ignored=INTS),
-    st.builds(Weights, epoch=INTS, version=INTS, learner_step=INTS, payload=st.binary()),
+    st.builds(Weights.of, epoch=INTS, version=INTS, learner_step=INTS, payload=st.binary()),
     st.builds(
         Stats,
         role=NAMES,

@@ -178,7 +178,7 @@ def watched() -> Iterator[StopSignal]:
 
 def first_weights() -> Weights:
     network = QNetwork("duel", stack=CONFIG.arena.stack, view_px=CONFIG.arena.view_px)
-    return Weights(1, 1, 0, weights_to_bytes(network))
+    return Weights.of(1, 1, 0, weights_to_bytes(network))
 
 
 def streams_of(seen: dict[int, Transition]) -> dict[tuple[int, int], Stream]:
@@ -224,7 +224,7 @@ def test_every_transition_arrives_once_whole_and_in_order(
             writer.publish(weights)
             reader = ReplayReader(session, keys, BATCH, 1, 2, 10.0, watched)
             witness = Witness(CONFIG, reader, weights)
-            renamed = Weights(1, 2, 0, weights.payload)  # so that actions stay comparable
+            renamed = Weights.of(1, 2, 0, weights.payload)  # so that actions stay comparable
             try:
                 acknowledged = disturb(
                     tmp_path, joining, replay, listener, witness, lambda: writer.publish(renamed)

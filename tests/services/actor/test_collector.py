@@ -94,7 +94,7 @@ def collect(steps: int, *, prioritized: bool = False) -> Collected:
     for step in range(steps):
         if step == 5:
             payload = weights_to_bytes(make_network())
-            policy.policy.adopt(Weights(0, version=8, learner_step=80, payload=payload))
+            policy.policy.adopt(Weights.of(0, version=8, learner_step=80, payload=payload))
         new_chunks, new_summaries = collector.step(EPSILONS)
         chunks += new_chunks
         summaries += new_summaries

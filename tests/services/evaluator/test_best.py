@@ -35,7 +35,7 @@ def offer(best: Best, version: int, rate: float, frames: float) -> None:
         seed=1,
         wall_s=1.0,
     )
-    best.offer(Weights(0, version, 10 * version, f"weights {version}".encode()), result)
+    best.offer(Weights.of(0, version, 10 * version, f"weights {version}".encode()), result)
 
 
 def kept(path: Path) -> str:

@@ -24,7 +24,7 @@ def judged(results: list[EpisodeResult]) -> Evaluation:
     return evaluation(
         results,
         worker="evaluator-0",
-        weights=Weights(1, 7, 700, b""),
+        weights=Weights.of(1, 7, 700, b""),
         num_robots=2,
         seed=5,
         wall_s=2.5,

@@ -38,7 +38,7 @@ def config_of(codec: str, sampler: str) -> Config:
 
 def collect(config: Config, learner: Learner, num_transitions: int) -> list[Chunk]:
     policy = make_policy(config)
-    policy.adopt(Weights(0, 1, 0, learner.payload()))
+    policy.adopt(Weights.of(0, 1, 0, learner.payload()))
     collector = make_collector(config, "actor-0", policy)
     epsilons = np.full(config.actor.num_arenas, 0.5, np.float32)
     chunks: list[Chunk] = []
