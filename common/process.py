@@ -136,14 +136,16 @@ def noted_endpoint(run_dir: Path, flag: str) -> str:
         ) from error
 
 
-def fetch_config(session: Session, joining: Joining, stop: StopSignal) -> Config:
+def fetch_config(
+    session: Session, joining: Joining, stop: StopSignal, timeout_s: float = 30.0
+) -> Config:
     """The run's configuration, from its replay service, under this process's own settings.
 
-    Raises DeadlineError where nobody serves that run for 30 s.
+    Raises DeadlineError where nobody serves that run within the time.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)
-    deadline = time.monotonic() + 30.0
+    deadline = time.monotonic() + timeout_s
     while True:
         try:
             text = bytes(client.ask(b"").result()).decode()

@@ -1,11 +1,13 @@
 """Live weights: the learner publishes, whoever joins late asks once, everyone holds the newest.
 
 Invariants: what a reader returns only ever gets newer, by (epoch, version); a message that is
-torn or foreign is counted and dropped. Bytes in, bytes out: nothing here knows torch.
+torn, altered or foreign is counted and dropped. Bytes in, bytes out: nothing here knows torch.
 """
 
 import logging
+import math
 import threading
+import time
 
 from common.errors import TransportError, WireError
 from common.framing import Part
@@ -93,17 +95,17 @@ class WeightsReader:
 
     @property
     def refused(self) -> int:
-        """Messages that were torn, foreign or too large."""
+        """Messages that were torn, altered, foreign or too large."""
         return self._refused + self._subscriber.oversized
 
     def latest(self, timeout_s: float = 0.0) -> Weights | None:
         """Weights newer than the last returned; None where none came within the time."""
         return self._newer(self._subscriber.take(timeout_s))
 
-    def wait(self, stop: StopSignal) -> Weights | None:
-        """The first weights, asked for and listened for until they come; None when stopped."""
-        told = False
-        while not stop.is_set():
+    def wait(self, stop: StopSignal, timeout_s: float = math.inf) -> Weights | None:
+        """The first weights, asked for and listened for; None when stopped, or after the time."""
+        told, deadline = False, time.monotonic() + timeout_s
+        while not stop.is_set() and time.monotonic() < deadline:
             weights = self._newer(self._ask()) or self.latest(_ASK_AGAIN_S)
             if weights is not None:
                 return weights
