@@ -4,6 +4,7 @@ MrcdrlError
 ├── ConfigError         a setting is unknown, impossible or contradicts another
 ├── RunDirectoryError   a run's folder exists, is missing, or cannot be written
 ├── CheckpointError     weights or a checkpoint cannot be read, are foreign or damaged
+├── DivergedError       learning led to numbers that are not finite: it would do so again
 ├── WireError           bytes from a peer break the wire's schema (counted and dropped)
 └── TransportError      the network did not do what was asked
     ├── EndpointError   an endpoint cannot be listened on or connected to
@@ -17,6 +18,8 @@ MrcdrlError
 class MrcdrlError(Exception):
     """Base of all errors raised on purpose; its text is one line, fit to be shown to a user."""
 
+    exit_code = 1  # of a process that it ends
+
 
 class ConfigError(MrcdrlError):
     """A setting is unknown, impossible or contradicts another."""
@@ -28,6 +31,12 @@ class RunDirectoryError(MrcdrlError):
 
 class CheckpointError(MrcdrlError):
     """Weights or a checkpoint cannot be read, are foreign or damaged."""
+
+
+class DivergedError(MrcdrlError):
+    """Learning led to numbers that are not finite; a learner started again would diverge again."""
+
+    exit_code = 3
 
 
 class WireError(MrcdrlError):

@@ -124,29 +124,42 @@ class QNetwork(nn.Module):
                 operands[name] = parameter.to(self.compute_dtype)
         return operands
 
-    def evaluate(self, states: Tensor, operands: Operands) -> Tensor:
+    def evaluate(
+        self, states: Tensor, operands: Operands, seen: list[Tensor] | None = None
+    ) -> Tensor:
         """Values float32 [B, num_actions] of what `prepare` and `operands` returned.
 
-        Pooling before the ReLU is the same as after it, on a quarter of the numbers.
+        Pooling before the ReLU is the same as after it, on a quarter of the numbers. seen: where
+        each hidden layer's outputs go, if anywhere.
         """
         x = functional.conv2d(states, operands["conv1.weight"], operands["conv1.bias"], stride=2)
-        x = functional.relu_(functional.max_pool2d(x, 2))
+        x = _relu(functional.max_pool2d(x, 2), seen)
         x = functional.conv2d(x, operands["conv2.weight"], operands["conv2.bias"], stride=2)
-        x = functional.relu_(x)
+        x = _relu(x, seen)
         x = functional.conv2d(x, operands["conv3.weight"], operands["conv3.bias"])
-        features = functional.relu_(x).flatten(1)
+        features = _relu(x, seen).flatten(1)
         if self.kind == "duel":
-            value = _stream(features, operands, "value_hidden", "value")
-            advantage = _stream(features, operands, "advantage_hidden", "advantage")
+            value = _stream(features, operands, "value_hidden", "value", seen)
+            advantage = _stream(features, operands, "advantage_hidden", "advantage", seen)
             return value + advantage - advantage.mean(dim=1, keepdim=True)
-        return _stream(features, operands, "hidden", "action_value")
+        return _stream(features, operands, "hidden", "action_value", seen)
 
 
-def _stream(features: Tensor, operands: Operands, hidden: str, output: str) -> Tensor:
+def _stream(
+    features: Tensor, operands: Operands, hidden: str, output: str, seen: list[Tensor] | None
+) -> Tensor:
     """A hidden layer and, in float32, an output layer."""
     x = functional.linear(features, operands[f"{hidden}.weight"], operands[f"{hidden}.bias"])
-    x = functional.relu_(x).float()
+    x = _relu(x, seen).float()
     return functional.linear(x, operands[f"{output}.weight"], operands[f"{output}.bias"])
+
+
+def _relu(x: Tensor, seen: list[Tensor] | None) -> Tensor:
+    """In place."""
+    x = functional.relu_(x)
+    if seen is not None:
+        seen.append(x)
+    return x
 
 
 def weights_to_bytes(network: QNetwork, dtype: torch.dtype = torch.float32) -> bytes:

@@ -1,7 +1,7 @@
 """What every service's shell shares: signals, logging, joining a run, and a clean exit.
 
 Invariants: SIGTERM and SIGINT set one StopSignal; errors on purpose end the process with one
-line and exit code 1; bugs of ours crash with a traceback.
+line and their exit code; bugs of ours crash with a traceback.
 """
 
 import ctypes
@@ -79,7 +79,7 @@ def run_main(main: Callable[[], int | None]) -> int:
         return main() or 0
     except MrcdrlError as error:
         sys.stderr.write(f"mrcdrl: {error}\n")
-        return 1
+        return error.exit_code
     except KeyboardInterrupt:
         sys.stderr.write("mrcdrl: interrupted\n")
         return 130

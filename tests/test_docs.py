@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from common.arena.controllers import CONTROLLERS
-from common.config import Config, TransportConfig, preset_names
+from common.config import Config, TransportConfig, load_config, preset_names
 from common.keys import Keys
 from common.network import QNetwork, weights_to_bytes
 from common.trajectory import (
@@ -42,12 +42,15 @@ from services.dashboard.records import EpisodeRecord, EvaluationRecord
 from services.dashboard.state import RunState
 from services.dashboard.summary import summary
 from services.evaluator.navigation import Navigation, RobotNavigation
+from services.learner.learner import Learner
 from services.learner.meter import Meter
+from services.learner.vitals import Vitals
 from services.replay.__main__ import build
 from services.replay.contents import Contents
 from services.replay.digest import digest
 from services.replay.export import arrays
 from services.replay.service import ReplayService
+from tests.services.learner.test_learner import random_batch
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -259,8 +262,11 @@ def published(role: str) -> set[str]:
         config = Config()
         return set(ReplayService(config, *build(config), *[MagicMock(refused=0)] * 3).metrics())
     if role == "learner":
-        meter = Meter(MagicMock(), MagicMock(), None, MagicMock())
-        meter.last = MagicMock()
+        config = load_config(None, {"arena.view_px": "31", "learner.device": "cpu"})
+        learner = Learner(config.agent, config.learner, stack=4, view_px=31)
+        batch = random_batch(8)
+        meter = Meter(MagicMock(), MagicMock(), None, MagicMock(), Vitals(config, learner))
+        meter.last = (batch, learner.step(batch))
         return set(meter.metrics())
     return literal_keys(next(path for path, of in METRICS_OF.items() if of == role))
 

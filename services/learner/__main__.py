@@ -28,6 +28,7 @@ from services.learner.learner import Learner
 from services.learner.meter import Meter
 from services.learner.prefetch import Prefetcher
 from services.learner.priorities import PrioritiesSender
+from services.learner.vitals import Vitals
 from services.replay.client import PriorityWriter, ReplayReader
 
 _LOG = logging.getLogger("learner")
@@ -96,24 +97,28 @@ def run(
 ) -> None:
     """Learn until stopped or run.learner_steps is reached; leaves a last checkpoint.
 
-    priorities: where TD errors go; None where sampling is uniform.
+    priorities: where TD errors go; None where sampling is uniform. Raises DivergedError instead
+    of publishing or saving numbers that are not finite.
     """
-    meter = Meter(learner, prefetcher, priorities, keeper)
-    writer.publish(keeper.next_weights())
+    meter = Meter(learner, prefetcher, priorities, keeper, Vitals(config, learner))
     limit = config.run.learner_steps
-    while not stop.is_set() and (not limit or learner.learner_step < limit):
-        batch = meter.timed("data_wait", lambda: prefetcher.next(_POLL_S))
-        if batch is not None:
-            meter.last = update = meter.timed("step", partial(learner.step, batch))
-            if priorities is not None:
-                priorities.put(batch.keys, update.td_errors)
-            if learner.learner_step % config.learner.publish_period == 0:
-                meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
-            meter.timed("checkpoint", keeper.maybe_save)
-        reporter.maybe(meter.metrics)
-    writer.publish(keeper.next_weights())
-    keeper.save()
-    reporter.now(meter.metrics)
+    try:
+        writer.publish(keeper.next_weights())
+        while not stop.is_set() and (not limit or learner.learner_step < limit):
+            batch = meter.timed("data_wait", lambda: prefetcher.next(_POLL_S))
+            if batch is not None:
+                update = meter.timed("step", partial(learner.step, batch))
+                meter.last = (batch, update)
+                if priorities is not None:
+                    priorities.put(batch.keys, update.td_errors)
+                if learner.learner_step % config.learner.publish_period == 0:
+                    meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
+                meter.timed("checkpoint", keeper.maybe_save)
+            reporter.maybe(meter.metrics)
+        writer.publish(keeper.next_weights())
+        keeper.save()
+    finally:
+        reporter.now(meter.metrics)
     _LOG.info("stopped at learner step %d", learner.learner_step)
 
 

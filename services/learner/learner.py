@@ -14,7 +14,7 @@ from safetensors.torch import save as write_safetensors
 from torch import Tensor
 
 from common.config import AgentConfig, LearnerConfig
-from common.errors import CheckpointError, ConfigError
+from common.errors import CheckpointError, ConfigError, DivergedError
 from common.network import (
     SENT_AS,
     Operands,
@@ -112,22 +112,37 @@ class Learner:
         return Update(loss.detach(), td_errors, mean_q, gradient_norm)
 
     def payload(self) -> bytes:
-        """The online parameters for publication; raises CheckpointError if learning diverged."""
-        return weights_to_bytes(self.online, self._sent_as)
+        """The online parameters for publication; raises DivergedError if one is not finite."""
+        return self._to_bytes(self.online, self._sent_as)
 
     def state(self) -> LearnerState:
-        """A copy of everything; raises CheckpointError if learning diverged."""
+        """A copy of everything; raises DivergedError if a number of it is not finite."""
         moments = {
             f"{name}:{moment}": value.detach().cpu().contiguous()
             for name, parameter in self.online.named_parameters()
             for moment, value in self._optimizer.state[parameter].items()
         }
+        if not all(bool(torch.isfinite(moment).all()) for moment in moments.values()):
+            raise self._diverged("the optimiser has moments that are not finite")
         return LearnerState(
             learner_step=self.learner_step,
-            model=weights_to_bytes(self.online),
-            target=weights_to_bytes(self.target),
+            model=self._to_bytes(self.online, torch.float32),
+            target=self._to_bytes(self.target, torch.float32),
             optimizer=write_safetensors(moments),
             rng_state=dict(self.rng.bit_generator.state),
+        )
+
+    def _to_bytes(self, network: QNetwork, dtype: torch.dtype) -> bytes:
+        try:
+            return weights_to_bytes(network, dtype)
+        except CheckpointError as error:
+            raise self._diverged(str(error)) from error
+
+    def _diverged(self, what: str) -> DivergedError:
+        return DivergedError(
+            f"learning diverged by step {self.learner_step}: {what}. Nothing of it was published; "
+            "go on from the last checkpoint with a lower agent.learning_rate or with "
+            "agent.max_gradient_norm: mrcdrl train --resume"
         )
 
     def restore(self, state: LearnerState) -> None:

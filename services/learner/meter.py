@@ -4,10 +4,12 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from services.learner.batch import Batch
 from services.learner.keeper import Keeper
 from services.learner.learner import Learner, Update
 from services.learner.prefetch import Prefetcher
 from services.learner.priorities import PrioritiesSender
+from services.learner.vitals import Vitals
 
 T = TypeVar("T")
 
@@ -21,14 +23,16 @@ class Meter:
         prefetcher: Prefetcher,
         priorities: PrioritiesSender | None,
         keeper: Keeper,
+        vitals: Vitals,
     ) -> None:
         self._learner = learner
         self._prefetcher = prefetcher
         self._priorities = priorities
         self._keeper = keeper
+        self._vitals = vitals
         self._seconds = dict.fromkeys(("data_wait", "step", "publish", "checkpoint"), 0.0)
         self._started_s = time.perf_counter()
-        self.last: Update | None = None
+        self.last: tuple[Batch, Update] | None = None
 
     def timed(self, stage: str, work: Callable[[], T]) -> T:
         """Do the work; its time counts for the stage."""
@@ -51,8 +55,10 @@ class Meter:
         }
         metrics |= {f"{stage}_share": s / lived_s for stage, s in self._seconds.items()}
         if self.last is not None:
-            metrics["loss"] = float(self.last.loss)
-            metrics["mean_q"] = float(self.last.mean_q)
-            metrics["td_error_mean"] = float(self.last.td_errors.abs().mean())
-            metrics["gradient_norm"] = float(self.last.gradient_norm)
+            batch, update = self.last
+            metrics["loss"] = float(update.loss)
+            metrics["mean_q"] = float(update.mean_q)
+            metrics["td_error_mean"] = float(update.td_errors.abs().mean())
+            metrics["gradient_norm"] = float(update.gradient_norm)
+            metrics |= self._vitals.look(batch, update)
         return metrics

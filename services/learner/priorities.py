@@ -60,8 +60,9 @@ class PrioritiesSender:
         while (batches := self._take()) is not None:
             try:
                 errors = [td_errors.abs().cpu().numpy() for _, td_errors in batches]
-                keys = np.concatenate([keys for keys, _ in batches])
-                reply = self._writer.update(Priorities(keys, np.concatenate(errors)))
+                keys, found = np.concatenate([k for k, _ in batches]), np.concatenate(errors)
+                finite = bool(np.isfinite(found).all())  # else learning diverged, and soon says so
+                reply = self._writer.update(Priorities(keys, found)) if finite else None
             except Exception as error:  # noqa: BLE001  raised again by put, in the owner's thread
                 self._error = error
                 return

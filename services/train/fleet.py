@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from common.config import ENV_PREFIX
-from common.errors import MrcdrlError
+from common.errors import DivergedError, MrcdrlError
 from common.process import DIE_WITH_PARENT
 
 _LOG = logging.getLogger("train")
@@ -82,7 +82,8 @@ class Fleet:
     def watch(self) -> str | None:
         """Start again what crashed; why the run must end, if it must.
 
-        Raises MrcdrlError where a service fails right after its start, or again and again.
+        Raises MrcdrlError where a service fails right after its start, or again and again, or
+        where learning diverged.
         """
         for service in self._services:
             code = None if service.process is None else service.process.poll()
@@ -99,7 +100,11 @@ class Fleet:
                     "%s was stopped by hand; mrcdrl %s --run %s --id %s starts one again",
                     *(service.worker, service.role, self._logs.parent.name, service.worker),
                 )
-            elif lived_s < _MIN_LIFE_S or service.restarts == _MAX_RESTARTS:
+            elif (
+                lived_s < _MIN_LIFE_S
+                or service.restarts == _MAX_RESTARTS
+                or code == DivergedError.exit_code
+            ):
                 raise MrcdrlError(
                     f"{service.worker} failed: {service.last_line()} (log: {service.log_path})"
                 )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from common.config import AgentConfig, LearnerConfig
-from common.errors import CheckpointError, ConfigError
+from common.errors import CheckpointError, ConfigError, DivergedError
 from common.trajectory import Float32Array
 from services.learner.batch import Batch
 from services.learner.learner import Learner
@@ -215,8 +215,21 @@ def test_a_state_of_another_agent_is_refused(agent: AgentConfig, message: str) -
 def test_diverged_weights_are_not_published() -> None:
     learner = make_learner()
     learner.step(dataclasses.replace(random_batch(), reward=torch.full((8,), torch.nan)))
-    with pytest.raises(CheckpointError, match="not finite"):
-        learner.payload()
+    for refused in (learner.payload, learner.state):
+        with pytest.raises(
+            DivergedError, match=r"diverged by step 1: .* not finite.*--resume"
+        ) as e:
+            refused()
+        assert "\n" not in str(e.value)
+
+
+def test_moments_that_are_not_finite_are_not_saved() -> None:
+    """The parameters are still whole: Adam divides by the root of infinity."""
+    learner = make_learner(AgentConfig(max_gradient_norm=0.0, loss="squared"))
+    learner.step(dataclasses.replace(random_batch(), reward=torch.full((8,), 1e24)))
+    learner.payload()
+    with pytest.raises(DivergedError, match="moments that are not finite"):
+        learner.state()
 
 
 @pytest.mark.parametrize("device", ["warp", "cuda:x"])

@@ -116,3 +116,17 @@ def test_close_ends_the_thread_with_the_message_under_way() -> None:
         put(sender, 2)
     assert writer.sent.empty()
     assert threading.active_count() == before
+
+
+def test_errors_that_are_not_finite_stay_here() -> None:
+    """Replay would refuse them; the learner itself says that and when it diverged."""
+    writer = FakeWriter()
+    with sending(writer) as sender:
+        sender.put(np.array([1, 2]), torch.tensor([torch.nan, 1.0]))
+        for _ in range(200):
+            if sender.dropped:
+                break
+            threading.Event().wait(0.05)
+        assert sender.dropped == 1
+        put(sender, 3)
+        assert writer.next().keys.tolist() == [30, 31]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import MrcdrlError
+from common.errors import DivergedError, MrcdrlError
 from services.train import fleet as fleet_module
 from services.train.fleet import Fleet
 
@@ -154,6 +154,17 @@ def test_a_service_that_ends_again_and_again_ends_the_run(
     fleet.start("actor", "actor-0", [])
     assert watch_until_ended(fleet) is None
     with pytest.raises(MrcdrlError, match="actor-0 failed"):
+        watch_until_ended(fleet)
+
+
+def test_a_learner_that_diverged_is_not_started_again(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
+    code = DivergedError.exit_code
+    put(beside, "learner", f"import sys; print('mrcdrl: learning diverged'); sys.exit({code})")
+    fleet.start("learner", "learner-0", [])
+    with pytest.raises(MrcdrlError, match="learner-0 failed: mrcdrl: learning diverged"):
         watch_until_ended(fleet)
 
 
