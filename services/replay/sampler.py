@@ -17,6 +17,9 @@ _EPSILON = 1e-6  # so that a transition without any error is drawn now and then
 class Sampler(Protocol):
     """What the table asks of a sampler; a range is of consecutive keys."""
 
+    rng: np.random.Generator
+    """Of the draws."""
+
     @property
     def nbytes(self) -> int:
         """Memory of what it keeps a transition."""
@@ -67,7 +70,7 @@ class UniformSampler:
     largest = 1.0
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
+        self.rng = rng
 
     def raise_largest(self, priority: float) -> None:
         pass
@@ -85,7 +88,7 @@ class UniformSampler:
         return 0
 
     def sample(self, keys: range, size: int) -> tuple[Int64Array, Float64Array]:
-        drawn = keys.start + self._rng.integers(0, len(keys), size)
+        drawn = keys.start + self.rng.integers(0, len(keys), size)
         return drawn, np.full(size, 1.0 / len(keys))
 
     def total(self, keys: range) -> float:
@@ -106,7 +109,7 @@ class PrioritizedSampler:
     def __init__(self, capacity: int, exponent: float, rng: np.random.Generator) -> None:
         self._tree = SumTree(capacity)
         self._exponent = exponent
-        self._rng = rng
+        self.rng = rng
         self._largest = 1.0  # priority so far; of a transition that comes without one
 
     @property
@@ -135,7 +138,7 @@ class PrioritizedSampler:
         return len(keys)
 
     def sample(self, keys: range, size: int) -> tuple[Int64Array, Float64Array]:
-        slots = self._tree.sample(self._rng.random(size))
+        slots = self._tree.sample(self.rng.random(size))
         drawn = keys.start + (slots - keys.start) % len(self._tree)
         return drawn, self._tree.get(slots) / self._tree.total
 

@@ -1,4 +1,4 @@
-"""What the log does not keep: the learner's priorities and the limiter's counters, now and then.
+"""What the log does not keep: priorities, the limiter's counters, the draws; now and then.
 
     <directory>/snapshot
     magic, CRC-32 of all that follows uint32, length of the header uint32 (little-endian),
@@ -60,6 +60,7 @@ class Snapshot:
     samples: int  # of the rate limiter
     all_samples: int  # since the run began
     largest: float  # priority so far
+    rng_state: dict[str, Any] = field(repr=False)  # of the draws, as JSON takes it
     shares: Float64Array = field(repr=False)  # [N], priorities to the power; or [0]
     rewards: Float32Array = field(repr=False)  # [N], by which the transitions are known again
 
@@ -73,6 +74,7 @@ class Snapshot:
             samples=limiter.samples,
             all_samples=all_samples,
             largest=table.sampler.largest,
+            rng_state=dict(table.sampler.rng.bit_generator.state),
             shares=table.sampler.shares(table.keys),
             rewards=table.rewards(table.keys),
         )
@@ -96,6 +98,8 @@ class Snapshot:
             _LOG.warning("the snapshot is not about the log's transitions and is ignored")
             return False
         self._report(Settings.of(config))
+        if self.rng_state:
+            table.sampler.rng.bit_generator.state = self.rng_state
         if len(self.shares):
             table.sampler.raise_largest(self.largest)
             exponent = self.settings.priority_exponent
@@ -143,6 +147,7 @@ class Snapshot:
     def _parsed(cls, header: dict[str, Any], data: bytes) -> Self:
         lengths, offset = header.pop("lengths"), 0
         header["settings"] = Settings(**header["settings"])
+        header.setdefault("rng_state", {})  # of a file written before there was one
         for name, dtype in _ARRAYS.items():
             header[name] = np.frombuffer(data, dtype, lengths[name], offset)
             offset += header[name].nbytes

@@ -2,7 +2,9 @@
 
 import dataclasses
 import logging
+import struct
 import threading
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -269,6 +271,7 @@ def example() -> Snapshot:
         samples=64,
         all_samples=640,
         largest=3.5,
+        rng_state=np.random.default_rng(3).bit_generator.state,
         shares=np.array([0.5, 2.0, 0.25]),
         rewards=np.array([1, -5, 200], np.float32),
     )
@@ -342,3 +345,25 @@ def test_a_snapshot_that_cannot_be_written_is_said_once(
     writer._write()
     (warning,) = [r.getMessage() for r in caplog.records]
     assert warning == "no snapshot of the priorities was written: No such file or directory"
+
+
+def test_the_draws_go_on_and_do_not_begin_anew(tmp_path: Path) -> None:
+    first = start(tmp_path)
+    insert(first, *map(chunk, range(5)))
+    first._table.sample(32)
+    save(first, tmp_path)
+    again = start(tmp_path)
+    np.testing.assert_array_equal(again._table.sample(32).keys, first._table.sample(32).keys)
+
+
+def test_a_snapshot_from_before_the_draws_were_in_it_is_read() -> None:
+    without = (
+        dataclasses.replace(example(), rng_state={}).to_bytes().replace(b'"rng_state": {}, ', b"")
+    )
+    length = len(b'"rng_state": {}, ')
+    begin = len(b"mrcdrl replay snapshot 1\n")
+    (old,) = struct.unpack_from("<I", without, begin + 4)
+    body = without[begin + 8 :]
+    crc = zlib.crc32(body, zlib.crc32(struct.pack("<II", 0, old - length)))
+    data = without[:begin] + struct.pack("<II", crc, old - length) + body
+    assert Snapshot.from_bytes(data).rng_state == {}
