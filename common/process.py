@@ -23,6 +23,7 @@ from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, TransportConfig, apply_overrides, load_transport
 from common.errors import DeadlineError, EndpointError, MrcdrlError, TransportError
 from common.keys import Keys, check_name
+from common.heartbeat import Heartbeat
 from common.trajectory import Stats
 from common.transport import Publisher, Session
 from common.wire import encode
@@ -163,7 +164,7 @@ def available_cores() -> int:
 
 
 class StatsReporter:
-    """Publishes a service's metrics once a second, from its own main loop."""
+    """Publishes a service's metrics once a second, from its own main loop, and beats with it."""
 
     def __init__(self, publisher: Publisher, role: str, worker: str) -> None:
         self._publisher = publisher
@@ -184,4 +185,10 @@ class StatsReporter:
             numbers = {name: float(value) for name, value in metrics().items()}
             self._publisher.put(encode(Stats(self._role, self._worker, numbers, self._text)))
         except TransportError as error:
+        self._heartbeat = Heartbeat.of_environment()
             logging.getLogger(self._role).warning("stats not published: %s", error)
+    def worked(self, at_s: float | None = None) -> None:
+        """The service did something, or has nothing to do; `at_s`: then, by default now."""
+        self._heartbeat.worked(at_s)
+
+        self._heartbeat.beat()

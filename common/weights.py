@@ -8,6 +8,7 @@ import logging
 import math
 import threading
 import time
+from collections.abc import Callable
 
 from common.errors import TransportError, WireError
 from common.framing import Part
@@ -102,8 +103,16 @@ class WeightsReader:
         """Weights newer than the last returned; None where none came within the time."""
         return self._newer(self._subscriber.take(timeout_s))
 
-    def wait(self, stop: StopSignal, timeout_s: float = math.inf) -> Weights | None:
-        """The first weights, asked for and listened for; None when stopped, or after the time."""
+    def wait(
+        self,
+        stop: StopSignal,
+        timeout_s: float = math.inf,
+        meanwhile: Callable[[], None] = lambda: None,
+    ) -> Weights | None:
+        """The first weights, asked for and listened for; None when stopped, or after the time.
+
+        meanwhile: called several times a second at best, every few seconds at worst.
+        """
         told, deadline = False, time.monotonic() + timeout_s
         while not stop.is_set() and time.monotonic() < deadline:
             weights = self._newer(self._ask()) or self.latest(_ASK_AGAIN_S)
@@ -112,6 +121,7 @@ class WeightsReader:
             if not told:
                 _LOG.info("waiting for the learner's first weights")
                 told = True
+            meanwhile()
         return None
 
     def _ask(self) -> Part | None:

@@ -151,6 +151,7 @@ HEAVY = {"torch", "cv2", "numba", "pymunk", "matplotlib", "av", "safetensors", "
         ("services.cli", HEAVY),
         ("services.replay.client", HEAVY),
         ("services.train.__main__", {"torch", "safetensors"}),
+        ("common.heartbeat", {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}),
     ],
 )
 def test_what_a_module_brings_with_it(module: str, absent: set[str]) -> None:

@@ -85,19 +85,24 @@ class Actor:
 
     def run(self, stop: StopSignal) -> None:
         """Follow, step, send, tell, until stopped."""
-        self._adopt(self._reader.wait(stop))
+        self._adopt(self._reader.wait(stop, meanwhile=self._report))
         while not stop.is_set():
             self._follow()
             chunks, episodes = self._collector.step(self._epsilons)
             for chunk in chunks:
                 waiting_s = time.monotonic()
                 while not self._sender.put(chunk, timeout_s=0.2) and not stop.is_set():
+                    self._reporter.worked(self._sender.heard_s)
                     self._reporter.maybe(self._metrics)
                 self._waited_s += time.monotonic() - waiting_s
             for episode in episodes:
                 self._episodes.put(encode(episode))
-            self._reporter.maybe(self._metrics)
+            self._report()
         self._reporter.now(self._metrics)
+
+    def _report(self) -> None:
+        self._reporter.worked()
+        self._reporter.maybe(self._metrics)
 
     def _follow(self) -> None:
         """Adopt newer weights, and explore as their step and the number of actors say."""

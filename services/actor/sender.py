@@ -32,6 +32,11 @@ class Sender:
         """Chunks not acknowledged yet."""
         return self._spool.qsize()
 
+    @property
+    def heard_s(self) -> float:
+        """When replay last answered, on the monotonic clock."""
+        return self._writer.heard_s
+
     def put(self, chunk: Chunk, timeout_s: float) -> bool:
         """Spool the chunk; False where there was no room within the time.
 

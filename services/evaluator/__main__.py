@@ -73,7 +73,7 @@ class Evaluator:
 
     def run(self) -> None:
         """Judge, rest, take the newest weights, until stopped."""
-        weights = self._reader.wait(self._stop)
+        weights = self._reader.wait(self._stop, meanwhile=self._report)
         while weights is not None:
             began_s = time.monotonic()
             self._evaluate(weights)
@@ -105,8 +105,12 @@ class Evaluator:
         return newest
 
     def _go_on(self) -> bool:
-        self._reporter.maybe(self._metrics)
+        self._report()
         return not self._stop.is_set()
+
+    def _report(self) -> None:
+        self._reporter.worked()
+        self._reporter.maybe(self._metrics)
 
     def _metrics(self) -> dict[str, float]:
         return {

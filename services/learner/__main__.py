@@ -106,6 +106,7 @@ def run(
         writer.publish(keeper.next_weights())
         while not stop.is_set() and (not limit or learner.learner_step < limit):
             batch = meter.timed("data_wait", lambda: prefetcher.next(_POLL_S))
+            reporter.worked(prefetcher.heard_s if batch is None else None)
             if batch is not None:
                 update = meter.timed("step", partial(learner.step, batch))
                 meter.last = (batch, update)

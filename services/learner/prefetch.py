@@ -44,6 +44,11 @@ class Prefetcher:
         """Batches that wait."""
         return self._ready.qsize()
 
+    @property
+    def heard_s(self) -> float:
+        """When replay last answered, on the monotonic clock."""
+        return self._reader.heard_s
+
     def next(self, timeout_s: float) -> Batch | None:
         """The next batch; None where none is ready within the time.
 

@@ -74,6 +74,8 @@ def main(argv: Sequence[str]) -> int:
                 request = configs.take(_TICK_S)
                 if request is not None:
                     request.reply(shared)
+                if service.accepting:
+                    reporter.worked()
                 reporter.maybe(service.metrics)
         finally:
             service.stop()

@@ -46,6 +46,11 @@ class ReplayWriter:
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
 
+    @property
+    def heard_s(self) -> float:
+        """When replay last answered, on the monotonic clock; at first, when it was first asked."""
+        return self._patience.since
+
     def insert(self, chunks: Sequence[Chunk]) -> InsertReply | None:
         """The acknowledgement of all, at least one; None when stopped before it came.
 
@@ -106,6 +111,11 @@ class ReplayReader:
         self._patience = _Patience("replay has not answered with a mini-batch", warn_s)
         self._rng = np.random.default_rng(seed)
         self._stop = stop
+
+    @property
+    def heard_s(self) -> float:
+        """When replay last answered, on the monotonic clock; at first, when it was first asked."""
+        return self._patience.since
 
     def sample(self) -> Samples | None:
         """The next mini-batch, valid until the next call; None when stopped before it came.
@@ -225,13 +235,13 @@ class _Patience:
     def __init__(self, what: str, warn_s: float) -> None:
         self._what = what
         self._warn_s = warn_s
-        self._since = self._warned = time.monotonic()
+        self.since = self._warned = time.monotonic()
 
     def renew(self) -> None:
-        self._since = self._warned = time.monotonic()
+        self.since = self._warned = time.monotonic()
 
     def spend(self) -> None:
         now = time.monotonic()
         if now - self._warned >= self._warn_s:
             self._warned = now
-            _LOG.warning("%s for %.0f s; still waiting for it", self._what, now - self._since)
+            _LOG.warning("%s for %.0f s; still waiting for it", self._what, now - self.since)

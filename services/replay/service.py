@@ -76,6 +76,7 @@ class ReplayService:
         self._book = SequenceBook()
         self._earlier = {"inserts": 0, "samples": 0}  # that the limiter does not count
         self._changed = threading.Condition()
+        self._log_fails = False
         self._stopping = threading.Event()
         self._counts = dict.fromkeys(_COUNTS, 0)
         self._held = {"insert_held": False, "sample_held": False}
@@ -149,6 +150,11 @@ class ReplayService:
         snapshots = self._snapshots is None or self._snapshots.healthy
         return snapshots and all(thread.is_alive() for thread in self._threads)
 
+    @property
+    def accepting(self) -> bool:
+        """Nothing keeps chunks from being stored; False while the log cannot be written."""
+        return not self._log_fails
+
     def metrics(self) -> dict[str, float]:
         with self._changed:
             return {
@@ -208,11 +214,13 @@ class ReplayService:
             if self._log is not None:
                 self._log.append(message, self._table.next_key, len(chunk))
         except OSError as error:
+            self._log_fails = True
             self._counts["log_errors"] += 1
             if self._counts["log_errors"] == 1:
                 _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
             request.hold(f"replay's log cannot be written: {reason(error)}")
             return False
+        self._log_fails = False
         self._forget()
         return True
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from common.arguments import Parser
 from common.config import TransportConfig
+from common.heartbeat import Heartbeat
 from common.process import STOP_DEADLINE_S, StopSignal, run_main
 from common.transport import Session
 
@@ -24,11 +25,13 @@ def main(argv: Sequence[str]) -> int:
     transport = TransportConfig(
         listen=tuple(arguments.listen), connect=tuple(arguments.connect or ())
     )
+    heartbeat = Heartbeat.of_environment()
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(transport):
         _LOG.info("listening on %s", ", ".join(transport.listen))
         while not stop.wait(_TICK_S):
-            pass
+            heartbeat.worked()
+            heartbeat.beat()
     return 0
 
 
