@@ -4,6 +4,7 @@ Invariants: SIGTERM and SIGINT set one StopSignal; errors on purpose end the pro
 line and their exit code; bugs of ours crash with a traceback.
 """
 
+import argparse
 import ctypes
 import logging
 import os
@@ -22,8 +23,8 @@ from types import FrameType
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, TransportConfig, apply_overrides, load_transport
 from common.errors import DeadlineError, EndpointError, MrcdrlError, TransportError
-from common.keys import Keys, check_name
 from common.heartbeat import Heartbeat
+from common.keys import Keys, check_name
 from common.trajectory import Stats
 from common.transport import Publisher, Session
 from common.wire import encode
@@ -106,13 +107,26 @@ def joining_arguments(role: str, argv: Sequence[str]) -> Joining:
 
     Raises EndpointError where neither --connect nor the run's folder names an endpoint.
     """
-    parser = Parser(prog=f"mrcdrl {role}", description=f"Start the {role} of a run that is up.")
+    parser = joining_parser(role, f"Start the {role} of a run that is up.")
+    return joining_of(parser.parse_args(argv))
+
+
+def joining_parser(command: str, description: str) -> Parser:
+    """The flags of a command that joins a run."""
+    parser = Parser(prog=f"mrcdrl {command}", description=description)
     parser.add_argument("--run", required=True, help="the run's name")
     parser.add_argument("--connect", action="append", help="endpoint, such as tcp/HOST:7447")
     parser.add_argument("--id", help="this worker's name; by default from the host and process")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     add_config_flags(parser)
-    arguments = parser.parse_args(argv)
+    return parser
+
+
+def joining_of(arguments: argparse.Namespace) -> Joining:
+    """What those flags say.
+
+    Raises EndpointError where neither --connect nor the run's folder names an endpoint.
+    """
     run_dir = arguments.run_dir / check_name(arguments.run, "run name")
     worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", f"{socket.gethostname()}-{os.getpid()}")
     given = overrides(arguments)
@@ -171,7 +185,12 @@ class StatsReporter:
         self._role = role
         self._worker = worker
         self._text = {"incarnation": str(time.time_ns())}
+        self._heartbeat = Heartbeat.of_environment()
         self._due_s = 0.0
+
+    def worked(self, at_s: float | None = None) -> None:
+        """The service did something, or has nothing to do; `at_s`: then, by default now."""
+        self._heartbeat.worked(at_s)
 
     def maybe(self, metrics: Callable[[], dict[str, float]]) -> None:
         """Publish if a second has passed since the last time."""
@@ -185,10 +204,5 @@ class StatsReporter:
             numbers = {name: float(value) for name, value in metrics().items()}
             self._publisher.put(encode(Stats(self._role, self._worker, numbers, self._text)))
         except TransportError as error:
-        self._heartbeat = Heartbeat.of_environment()
             logging.getLogger(self._role).warning("stats not published: %s", error)
-    def worked(self, at_s: float | None = None) -> None:
-        """The service did something, or has nothing to do; `at_s`: then, by default now."""
-        self._heartbeat.worked(at_s)
-
         self._heartbeat.beat()

@@ -14,6 +14,7 @@ _COMMANDS = {
     "config": ("services.configure", "print the resolved configuration"),
     "replay": ("services.replay.__main__", "serve the replay table of a run"),
     "replay inspect": ("services.replay.inspect", "what the replay log of a run holds"),
+    "status": ("services.train.status", "what a run that is up does, and what limits it"),
     "router": ("services.router.__main__", "relay between the processes of runs"),
     "actor": ("services.actor.__main__", "collect for a run that is up"),
     "learner": ("services.learner.__main__", "learn for a run that is up"),

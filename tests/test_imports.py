@@ -51,7 +51,7 @@ PLACES = {
 # The dashboard is no process: the launcher shows and records a run by its modules, and the
 # evaluator's commands draw by them.
 DRAWN_BY_DASHBOARD = {
-    "services/train": {"recorder", "screen", "state", "stopping"},
+    "services/train": {"limiting", "recorder", "screen", "state", "stopping"},
     "services/evaluator": {"figures", "film", "paper"},
 }
 
@@ -151,6 +151,7 @@ HEAVY = {"torch", "cv2", "numba", "pymunk", "matplotlib", "av", "safetensors", "
         ("services.cli", HEAVY),
         ("services.replay.client", HEAVY),
         ("services.train.__main__", {"torch", "safetensors"}),
+        ("services.train.status", HEAVY - {"rich"}),
         ("common.heartbeat", {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}),
     ],
 )

@@ -4,12 +4,8 @@ import logging
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-
-from rich.console import Console
-from rich.live import Live
 
 from common.arena import test_starts
 from common.arguments import Parser, add_config_flags, overrides
@@ -20,9 +16,9 @@ from common.keys import Keys, check_name
 from common.process import StopSignal, available_cores, run_main
 from common.transport import Session, free_endpoint
 from services.dashboard.recorder import Recorder
-from services.dashboard.screen import plain_line, screen
 from services.dashboard.state import RunState
 from services.dashboard.stopping import StoppingRule
+from services.train.display import display
 from services.train.fleet import Fleet
 from services.train.follower import Follower
 from services.train.rundir import RunDirectory, default_name
@@ -30,7 +26,6 @@ from services.train.rundir import RunDirectory, default_name
 _LOG = logging.getLogger("train")
 _DEFAULT = "quick"
 _TICK_S = 0.25
-_PLAIN_PERIOD_S = 10.0
 _PICTURES_S = 300.0
 _JOIN_S = 60.0
 _ENOUGH_CORES = 4
@@ -182,46 +177,6 @@ def expectation(config: Config) -> str:
 def default_actors() -> int:
     """Half the cores, the other half is the learner's; at least 1."""
     return max(1, available_cores() // 2)
-
-
-@contextmanager
-def display(
-    state: RunState, config: Config, name: str, clock: Callable[[], float]
-) -> Iterator[Callable[[], None]]:
-    """A function that shows the state: a live screen, or plain lines where there is no terminal."""
-    console = Console()
-    if not console.is_terminal:
-        due_s = [0.0]
-
-        def print_line() -> None:
-            if clock() >= due_s[0]:
-                due_s[0] = clock() + _PLAIN_PERIOD_S
-                console.print(plain_line(state, clock()), soft_wrap=True, highlight=False)
-
-        yield print_line
-        return
-    with logging_to(state), Live(console=console, screen=True, auto_refresh=False) as live:
-        yield lambda: live.update(screen(state, config, clock(), name), refresh=True)
-
-
-@contextmanager
-def logging_to(state: RunState) -> Iterator[None]:
-    """The launcher's own log lines go into the state: written over a screen they would spoil it."""
-    root = logging.getLogger()
-    streams, root.handlers = root.handlers, [_StateHandler(state)]
-    try:
-        yield
-    finally:
-        root.handlers = streams
-
-
-class _StateHandler(logging.Handler):
-    def __init__(self, state: RunState) -> None:
-        super().__init__()
-        self._state = state
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._state.observe_log(record.getMessage())
 
 
 def draw(run_dir: Path) -> None:

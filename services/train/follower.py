@@ -1,4 +1,4 @@
-"""What the launcher hears of its run, folded into the state, the record and the stopping rule."""
+"""What a run says of itself, folded into the state, the record and the stopping rule."""
 
 import logging
 import time
@@ -19,10 +19,18 @@ M = TypeVar("M")
 
 
 class Follower:
-    """Subscribes to everything a run says of itself."""
+    """Subscribes to everything a run says of itself.
+
+    recorder: what writes it down; None where nothing does.
+    """
 
     def __init__(
-        self, session: Session, keys: Keys, state: RunState, recorder: Recorder, rule: StoppingRule
+        self,
+        session: Session,
+        keys: Keys,
+        state: RunState,
+        recorder: Recorder | None,
+        rule: StoppingRule,
     ) -> None:
         self._stats = session.queue_subscriber(keys.every_stats)
         self._episodes = session.queue_subscriber(keys.every_episode)
@@ -31,7 +39,7 @@ class Follower:
         self._state = state
         self._recorder = recorder
         self._rule = rule
-        self._lasted_s = state.resumed_at_s = recorder.restore(state, rule)
+        self._lasted_s = state.resumed_at_s = recorder.restore(state, rule) if recorder else 0.0
         self._started_s = time.monotonic()
         self._record_due_s = 0.0
 
@@ -45,8 +53,9 @@ class Follower:
         """Seconds since this start."""
         return time.monotonic() - self._started_s
 
-    def listen(self, timeout_s: float) -> None:
-        """Take in what has arrived, waiting up to `timeout_s` for something."""
+    def listen(self, timeout_s: float) -> bool:
+        """Take in what has arrived, waiting up to `timeout_s` for something; whether any service
+        has told its figures."""
         first = self._stats.take(timeout_s)
         if first is not None:
             self._take(Stats, first[1], lambda s: self._state.observe_stats(s, self.now))
@@ -58,9 +67,10 @@ class Follower:
             self._take(Evaluation, payload, self._observe_evaluation)
         for key, alive in self._presence.changes():
             self._state.observe_presence(*role_and_worker(key), alive)
-        if self.lived_s >= self._record_due_s:
+        if self._recorder and self.lived_s >= self._record_due_s:
             self._record_due_s = self.lived_s + 1.0
             self._recorder.record_metrics(self._state, self.now)
+        return first is not None
 
     def stop_reason(self) -> str | None:
         """Why the run should end now; minutes count from this start."""
@@ -69,12 +79,14 @@ class Follower:
     def _observe_episode(self, episode: EpisodeSummary) -> None:
         self._state.observe_episode(episode)
         self._rule.observe_episode(episode)
-        self._recorder.record_episode(episode, self._state, self.now)
+        if self._recorder:
+            self._recorder.record_episode(episode, self._state, self.now)
 
     def _observe_evaluation(self, evaluation: Evaluation) -> None:
         record = self._state.observe_evaluation(evaluation, self.now)
         self._rule.observe_evaluation(evaluation)
-        self._recorder.record_evaluation(record)
+        if self._recorder:
+            self._recorder.record_evaluation(record)
 
     def _take(self, cls: type[M], payload: bytes, observe: Callable[[M], None]) -> None:
         try:

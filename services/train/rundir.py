@@ -79,6 +79,15 @@ class RunDirectory:
         return cls._opened(path, config, resumed=True)
 
     @classmethod
+    def join(cls, path: Path, config: Config) -> Self:
+        """The folder of a run that is up, made where it is missing, for who keeps its records."""
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunDirectoryError(f"cannot make {path}: {reason(error)}") from error
+        return cls._opened(path, config, resumed=True)
+
+    @classmethod
     def _opened(cls, path: Path, config: Config, *, resumed: bool) -> Self:
         try:
             run = cls(path, config, resumed=resumed)

@@ -6,7 +6,7 @@ import pytest
 
 from common.config import Config
 from services.dashboard.state import RunState
-from services.train.__main__ import logging_to
+from services.train.display import logging_to
 
 
 def test_log_lines_go_to_the_state_and_not_over_the_screen(

@@ -1,0 +1,67 @@
+"""`mrcdrl status`: what it says of a run, and whose folder it takes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from common.config import Config, TransportConfig
+from common.errors import RunDirectoryError
+from common.files import RUN_CONFIG
+from common.heartbeat import Heartbeat, Pulse
+from common.keys import Keys
+from common.process import StopSignal
+from common.trajectory import Stats
+from common.transport import Session, free_endpoint
+from common.wire import encode
+from services.dashboard.state import RunState
+from services.dashboard.stopping import StoppingRule
+from services.train.follower import Follower
+from services.train.rundir import RunDirectory
+from services.train.status import listen, status
+
+
+def test_of_nobody() -> None:
+    said = status(RunState(Config()), 0.0)
+    assert said["limited_by"] == "waiting for replay to be there"
+    assert said["services"] == []
+    json.dumps(said, allow_nan=False)
+
+
+def test_of_a_service_that_fell_silent() -> None:
+    state = RunState(Config())
+    state.observe_presence("replay", "replay-0", True)
+    state.observe_stats(Stats("actor", "a", {"robot_steps": 10.0, "loss": float("nan")}, {}), 2.0)
+    actor, replay = status(state, 9.0)["services"]
+    assert actor == {"role": "actor", "id": "a", "alive": True, "silent_s": 7.0}
+    assert replay == {"role": "replay", "id": "replay-0", "alive": True, "silent_s": None}
+    json.dumps(status(state, 9.0), allow_nan=False)
+
+
+def test_what_services_say_is_heard_and_is_work(tmp_path: Path) -> None:
+    keys, path = Keys("heard"), tmp_path / "heartbeat"
+    heartbeat, stop = Heartbeat(path), StopSignal()
+    with Session(TransportConfig(listen=(free_endpoint(),))) as session:
+        state = RunState(Config())
+        follower = Follower(session, keys, state, None, StoppingRule(Config().run))
+        born_s = follower.lived_s
+        publisher = session.publisher(keys.stats("actor", "a"))
+
+        def show() -> None:
+            publisher.put(encode(Stats("actor", "a", {"robot_steps": 5.0}, {})))
+            if state.robot_steps:
+                stop.set()
+
+        listen(follower, heartbeat, stop, show, until_s=60.0)
+    assert state.robot_steps == 5
+    assert follower.lived_s > born_s
+    heartbeat.beat()
+    assert Pulse.read(path).illness(Pulse.read(path).beat_s, 30.0) is None
+
+
+def test_a_run_that_is_recorded_is_locked(tmp_path: Path) -> None:
+    with RunDirectory.join(tmp_path / "run", Config()) as run:
+        assert (run.path / RUN_CONFIG).is_file()
+        with pytest.raises(RunDirectoryError, match="in use"):
+            RunDirectory.join(tmp_path / "run", Config())
+    RunDirectory.join(tmp_path / "run", Config()).close()
