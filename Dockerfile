@@ -1,0 +1,86 @@
+# An image a service: `docker build --target replay .`; `docker compose build` makes them all.
+# Replay, router and status work without PyTorch, and their images are small.
+ARG PYTHON=python:3.11-slim-bookworm
+
+# Wheels that pip prefers, such as another build of PyTorch: `--build-context wheels=FOLDER`.
+FROM scratch AS wheels
+COPY LICENSE /
+
+# -- what is installed: the exact versions of constraints.txt, the package last ----------------------
+
+FROM ${PYTHON} AS installer
+# Or a further index to look for such a build.
+ARG PIP_EXTRA_INDEX_URL
+ENV PIP_CONSTRAINT=/src/constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
+WORKDIR /src
+RUN python -m venv --without-pip /opt/mrcdrl
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+
+FROM installer AS small-installed
+RUN pip --python /opt/mrcdrl/bin/python install . \
+ && cd /opt/mrcdrl/lib/python3*/site-packages \
+ && find . -type d \( -name tests -o -path ./numpy/f2py -o -name include \) -prune -exec rm -rf {} + \
+ && find . -type f \( -name '*.pyi' -o -name '*.a' \) -delete
+COPY common common
+COPY services services
+COPY configs configs
+RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
+
+FROM installer AS learning-installed
+RUN --mount=type=bind,from=wheels,target=/wheels pip --python /opt/mrcdrl/bin/python install \
+    --find-links /wheels "$(grep '^torch==' constraints.txt)"
+RUN pip --python /opt/mrcdrl/bin/python install '.[arena,learn]'
+COPY common common
+COPY services services
+COPY configs configs
+RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
+
+# -- what all have: no root, one folder to keep runs in, health by the work that is done -------------
+
+FROM ${PYTHON} AS service
+ARG VERSION=0.1.0
+ARG REVISION=unknown
+LABEL org.opencontainers.image.title="mrcdrl" \
+      org.opencontainers.image.description="Distributed actor-learner for multi-robot coordination" \
+      org.opencontainers.image.licenses="Apache-2.0" \
+      org.opencontainers.image.version="${VERSION}" \
+      org.opencontainers.image.revision="${REVISION}"
+RUN useradd --uid 10001 --user-group --no-create-home --home-dir /tmp mrcdrl \
+ && install --directory --owner=mrcdrl --group=mrcdrl /runs /var/cache/mrcdrl
+ENV PATH=/opt/mrcdrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
+    MRCDRL_HEARTBEAT=/tmp/heartbeat
+WORKDIR /
+USER mrcdrl
+ENTRYPOINT ["mrcdrl"]
+# Not working for 30 s is unhealthy; a main loop that hangs for 120 s is killed, and started again.
+HEALTHCHECK --interval=5s --timeout=5s --start-period=120s --retries=2 \
+    CMD ["python", "-m", "common.heartbeat", "--max-age", "30", "--kill-after", "120"]
+
+FROM service AS small
+COPY --from=small-installed /opt/mrcdrl /opt/mrcdrl
+
+FROM service AS learning
+COPY --from=learning-installed /opt/mrcdrl /opt/mrcdrl
+# Compiled functions are kept here. Freed memory stays with the process, as with `mrcdrl train`.
+ENV NUMBA_CACHE_DIR=/var/cache/mrcdrl \
+    MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4294967296 MALLOC_TOP_PAD_=67108864
+
+# -- one target a service -----------------------------------------------------------------------------
+
+FROM small AS router
+CMD ["router", "--listen", "tcp/0.0.0.0:7447"]
+
+FROM small AS replay
+CMD ["replay", "--help"]
+
+FROM small AS status
+CMD ["status", "--help"]
+
+FROM learning AS actor
+CMD ["actor", "--help"]
+
+FROM learning AS evaluator
+CMD ["evaluator", "--help"]
+
+FROM learning AS learner
+CMD ["learner", "--help"]
