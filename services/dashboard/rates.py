@@ -1,12 +1,24 @@
-"""Sums over the last seconds: how fast a counter runs, and how often a flag was set.
+"""Sums over the last reports: how fast a counter runs, how often a flag was set, how far apart.
 
 Invariants: no clock inside, times come with the calls and do not fall; nothing older than the
 window is kept, so memory is bounded by the reports of one window.
 """
 
+import math
 from collections import deque
+from dataclasses import dataclass
 
 WINDOW_S = 10.0
+SPREAD_S = 600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """What the values of a window were like."""
+
+    min: float
+    mean: float
+    p99: float
 
 
 class Rate:
@@ -59,3 +71,24 @@ class Share:
     def mean(self) -> float:
         """0 when nothing was reported."""
         return sum(value for _, value in self._values) / max(1, len(self._values))
+
+
+class Spreading:
+    """Least, mean and 99th percentile of the values of the last SPREAD_S seconds."""
+
+    def __init__(self) -> None:
+        self._values: deque[tuple[float, float]] = deque()
+
+    def observe(self, value: float, now: float) -> None:
+        self._values.append((now, value))
+        while self._values[0][0] <= now - SPREAD_S:
+            self._values.popleft()
+
+    @property
+    def spread(self) -> Spread | None:
+        """None where nothing was reported; p99: of the values the least that 99 % do not exceed."""
+        if not self._values:
+            return None
+        values = sorted(value for _, value in self._values)
+        p99 = values[math.ceil(0.99 * len(values)) - 1]
+        return Spread(values[0], sum(values) / len(values), p99)

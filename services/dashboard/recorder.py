@@ -7,6 +7,7 @@ is on its way to disk at most one `record_metrics` later; a resumed run appends.
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -199,3 +200,8 @@ def _service_metrics(state: RunState) -> Iterator[tuple[str, float]]:
         if service.alive:
             for name, value in service.metrics.items():
                 yield f"{service.role}/{service.id}/{name}", value
+    spreads = state.staleness_spreads
+    for actor in state.alive("actor"):
+        for unit, spread in spreads.get(actor.id, {}).items():
+            for name, value in asdict(spread).items():
+                yield f"actor/{actor.id}/staleness_{unit}_{name}", round(value, 3)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from common.config import Config
 from common.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
-from services.dashboard.rates import Rate, Share
+from services.dashboard.rates import Rate, Share, Spread, Spreading
 from services.dashboard.records import EvaluationRecord
 
 ROLES = ("actor", "replay", "learner", "evaluator")
@@ -26,6 +26,7 @@ SHARES = {
     "replay": ("insert_held", "sample_held"),
     "learner": ("data_wait_share", "decode_share", "step_share", "publish_share"),
 }
+STALENESS = ("versions", "s")
 HUNDRED = 100
 HISTORY_PERIOD = 10  # episodes between two points of the curve of successes
 LOG_LINES = 100
@@ -43,6 +44,7 @@ class Service:
     text: dict[str, str] = field(default_factory=dict)
     rates: dict[str, Rate] = field(default_factory=dict)
     shares: dict[str, Share] = field(default_factory=dict)
+    staleness: dict[str, Spreading] = field(default_factory=dict)  # of an actor, by unit
 
     def per_second(self, name: str, now: float) -> float:
         """Rate of one of its counters; 0 for what it does not count."""
@@ -101,6 +103,9 @@ class RunState:
         for name in SHARES.get(stats.role, ()):
             if name in stats.metrics:
                 service.shares.setdefault(name, Share()).observe(stats.metrics[name], now)
+        stale = self.staleness(service) if stats.role == "actor" else None
+        for unit, value in zip(STALENESS, stale or (), strict=False):
+            service.staleness.setdefault(unit, Spreading()).observe(value, now)
 
     def observe_episode(self, episode: EpisodeSummary) -> None:
         self.episodes += 1
@@ -208,6 +213,15 @@ class RunState:
         """The worst of all actors, in versions and in seconds, each by itself."""
         known = [s for s in map(self.staleness, self.alive("actor")) if s is not None]
         return max((b for b, _ in known), default=0), max((a for _, a in known), default=0.0)
+
+    @property
+    def staleness_spreads(self) -> dict[str, dict[str, Spread]]:
+        """Of each actor ever heard of, by unit: over its reports of the last ten minutes."""
+        return {
+            s.id: {unit: spread for unit, each in s.staleness.items() if (spread := each.spread)}
+            for s in self.services
+            if s.staleness
+        }
 
     # -- replay and exploration -----------------------------------------------------------
 

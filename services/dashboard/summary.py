@@ -41,6 +41,10 @@ def summary(state: RunState, config: Config, now: float, stop_reason: str) -> di
         "inserts": state.inserts,
         "samples": state.samples,
         "weights_version": state.weights_version,
+        "staleness": {
+            actor: {unit: asdict(spread) for unit, spread in spreads.items()}
+            for actor, spreads in state.staleness_spreads.items()
+        },
         "training_success_per_100": training_table(state),
         "evaluation": {
             "count": len(state.evaluations),

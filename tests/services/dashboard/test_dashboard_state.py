@@ -5,6 +5,7 @@ import pytest
 from common.config import Config, load_config
 from common.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
 from services.dashboard.limiting import limiting_stage
+from services.dashboard.recorder import flat_metrics
 from services.dashboard.state import RunState
 
 
@@ -128,6 +129,26 @@ def test_staleness_epsilon_and_presence_follow_the_actors_that_are_there() -> No
     assert state.epsilons == (0.1, 0.2)
     assert [service.alive for service in state.services] == [True, False, True]
     assert state.env_steps == 2
+
+
+def test_an_actors_staleness_is_spread_over_its_last_ten_minutes() -> None:
+    state = RunState(config())
+    state.observe_stats(actor(1, "early", weights_version=0, weights_age_s=1.0), 0)
+    assert state.staleness_spreads == {}, "no learner has been heard of"
+    for second in range(1000):
+        state.observe_stats(learner(10, weights_version=5000), second)
+        behind = 50 if second == 990 else 1000 if second < 400 else second % 2
+        age = {"weights_version": 5000 - behind, "weights_age_s": 0.5 * behind}
+        state.observe_stats(actor(1, "a", **age), second)
+    assert flat_metrics(state, 999.0)["actor/a/staleness_versions_p99"] == 1
+    state.observe_presence("actor", "a", alive=False)
+    assert "actor/a/staleness_versions_p99" not in flat_metrics(state, 999.0)
+    found = state.staleness_spreads
+    assert list(found) == ["a"]
+    versions, seconds = found["a"]["versions"], found["a"]["s"]
+    assert (versions.min, versions.p99) == (0, 1)
+    assert versions.mean == pytest.approx((300 + 50) / 600)
+    assert (seconds.min, seconds.mean, seconds.p99) == pytest.approx((0, 0.5 * 350 / 600, 0.5))
 
 
 def test_time_left_is_the_nearer_of_minutes_and_learner_steps() -> None:
