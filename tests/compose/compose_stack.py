@@ -1,0 +1,167 @@
+"""A Docker engine for the tests, and the stack on it.
+
+Invariants: an engine that was there is left as it was, one brought up here is taken down; all the
+stack makes bears its project's name, save the images, and is removed at the end; every wait has a
+deadline and says what it waited for.
+"""
+
+import json
+import os
+import subprocess
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SMOKE = Path(__file__).with_name("smoke.yml")
+ENGINE_VARIABLE = "MRCDRL_DOCKER_ENGINE"  # a script that brings an engine up and down
+WHEELS_VARIABLE = "PIP_FIND_LINKS"
+LEARNING = ("actor", "learner", "evaluator")  # whose images hold PyTorch
+T = TypeVar("T")
+
+
+def works(environment: Mapping[str, str]) -> bool:
+    """Whether there is an engine, with Compose."""
+    try:
+        for command in (["docker", "compose", "version"], ["docker", "info"]):
+            subprocess.run(
+                command, env=dict(environment), capture_output=True, check=True, timeout=30
+            )
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return True
+
+
+@contextmanager
+def engine(folder: Path) -> Iterator[dict[str, str] | None]:
+    """The environment in which `docker compose` works; None where no engine can be had."""
+    script = os.environ.get(ENGINE_VARIABLE)
+    if works(os.environ):
+        yield dict(os.environ)
+    elif not script or os.geteuid() != 0:
+        yield None
+    else:
+        home = Path(os.environ.get("ENGINE_HOME", folder / "engine"))
+        environment = {**os.environ, "ENGINE_HOME": str(home)}
+        subprocess.run([script, "up"], env=environment, check=True, timeout=900)
+        try:
+            shown = subprocess.run(
+                ["bash", "-c", '. "$ENGINE_HOME/env.sh" && env -0'],
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=10,
+            )
+            yield dict(line.split("=", 1) for line in shown.stdout.split("\0") if line)
+        finally:
+            subprocess.run([script, "down"], env=environment, check=True, timeout=120)
+
+
+@dataclass(frozen=True, slots=True)
+class Container:
+    """One container as the engine sees it."""
+
+    id: str
+    running: bool
+    health: str
+    restarts: int
+    exit_code: int
+
+
+class Stack:
+    """`docker compose …` with the smoke override, under a project name of its own."""
+
+    def __init__(self, environment: Mapping[str, str], folder: Path) -> None:
+        self.project = f"mrcdrl-test-{uuid.uuid4().hex[:8]}"
+        self._environment = dict(environment)
+        files = [REPOSITORY / "docker-compose.yml", SMOKE, wheels_override(environment, folder)]
+        self._head = ["docker", "compose", "--project-name", self.project]
+        self._head += [word for file in files for word in ("--file", str(file))]
+
+    def compose(self, *arguments: str, timeout_s: float = 120.0) -> str:
+        """Its output; fails with all it said."""
+        return self._run([*self._head, *arguments], timeout_s)
+
+    def docker(self, *arguments: str) -> str:
+        return self._run(["docker", *arguments], 60.0)
+
+    def containers(self, service: str) -> list[Container]:
+        """Those of a service, stopped ones too, in the order they were made."""
+        ids = self.compose("ps", "--all", "--quiet", service).split()
+        return sorted(map(self.container, ids), key=lambda c: c.id) if ids else []
+
+    def container(self, container_id: str) -> Container:
+        found: dict[str, Any] = json.loads(self.docker("inspect", container_id))[0]
+        state = found["State"]
+        return Container(
+            container_id,
+            state["Running"],
+            state.get("Health", {}).get("Status", ""),
+            found["RestartCount"],
+            state["ExitCode"],
+        )
+
+    def signal(self, container: Container, name: str) -> None:
+        """To the service's process, not to the container: `docker kill` would count as a stop."""
+        command = f"kill -{name} $(cut -d' ' -f1 /tmp/heartbeat)"
+        self.docker("exec", container.id, "sh", "-c", command)
+
+    def status(self) -> dict[str, Any]:
+        """What `mrcdrl status --json` says now."""
+        said = self.compose(
+            *("exec", "--no-TTY", "status", "mrcdrl", "status", "--run", "stack"),
+            *("--connect", "tcp/router:7447", "--json"),
+        )
+        told: dict[str, Any] = json.loads(said)
+        return told
+
+    def eventually(self, look: Callable[[], T | None], what: str, timeout_s: float) -> T:
+        """What `look` returns as soon as that is true; fails with the logs after the time."""
+        deadline, pause = time.monotonic() + timeout_s, threading.Event()
+        while not (found := look()):
+            if time.monotonic() > deadline:
+                logs = self.compose("logs", "--no-color", "--tail", "20")
+                raise AssertionError(f"in {timeout_s:g} s not: {what}\n{logs}")
+            pause.wait(0.5)
+        return found
+
+    def remove(self) -> None:
+        self.compose("down", "--volumes", "--timeout", "5", timeout_s=180)
+
+    def left(self) -> list[str]:
+        """Containers, volumes and networks that bear the project's name."""
+        label = f"label=com.docker.compose.project={self.project}"
+        return [
+            line
+            for kind in (["ps", "--all"], ["volume", "ls"], ["network", "ls"])
+            for line in self.docker(*kind, "--quiet", "--filter", label).split()
+        ]
+
+    def _run(self, command: list[str], timeout_s: float) -> str:
+        result = subprocess.run(
+            command,
+            cwd=REPOSITORY,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+        assert result.returncode == 0, f"{' '.join(command)}\n{result.stdout}\n{result.stderr}"
+        return result.stdout
+
+
+def wheels_override(environment: Mapping[str, str], folder: Path) -> Path:
+    """A compose file by which the images get wheels from where pip gets them on this machine."""
+    links = [Path(word) for word in environment.get(WHEELS_VARIABLE, "").split()]
+    folders = [str(link) for link in links if link.is_dir()]
+    build = {"build": {"additional_contexts": {"wheels": folders[0]}}} if folders else {}
+    path = folder / "wheels.json"  # JSON is YAML
+    path.write_text(json.dumps({"services": dict.fromkeys(LEARNING, build)}), "utf-8")
+    return path
