@@ -41,7 +41,7 @@ def test_arena_measures_every_part_and_the_rival(
 ) -> None:
     rival = program(tmp_path / "python", "while read seconds; do echo 768; done")
     result = printed(monkeypatch, capsys, arena, *BRIEF, "--pusht-python", rival)
-    parts = ("physics", "drawing", "both", "literal_drawing", "literal_both")
+    parts = ("physics", "pymunk_physics", "drawing", "both", "literal_drawing", "literal_both")
     names = {f"{part}_2_robot_steps_per_s" for part in parts} | {"pusht_pictures_per_s"}
     assert set(result["rates"]) == names
     assert all(rate["min"] > 0 for rate in result["rates"].values())

@@ -96,7 +96,8 @@ class Recorder:
             state.evaluations.append(evaluation)
             rule.observe_evaluation(evaluation.evaluation)
             time_s = max(time_s, evaluation.time_s)
-        state.restore_collected(metrics.get("env_steps", 0), metrics.get("robot_steps", 0))
+        counted = (metrics.get(n, 0) for n in ("env_steps", "robot_steps", "learner_steps"))
+        state.restore_counted(*counted)
         return time_s
 
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:

@@ -77,6 +77,7 @@ class RunState:
         self._outcomes = bytearray()
         self._services: dict[tuple[str, str], Service] = {}
         self._collected = {"env_steps": 0.0, "robot_steps": 0.0}
+        self._learner_steps_before = 0  # until the learner of this start is heard of
 
     def __repr__(self) -> str:
         return (
@@ -132,10 +133,11 @@ class RunState:
         """A warning for the screen."""
         self.log.append(line)
 
-    def restore_collected(self, env_steps: float, robot_steps: float) -> None:
-        """Adds what the actors of the run's earlier processes counted."""
+    def restore_counted(self, env_steps: float, robot_steps: float, learner_steps: float) -> None:
+        """Adds what actors of the run's earlier processes counted; the learner counts on itself."""
         self._collected["env_steps"] += env_steps
         self._collected["robot_steps"] += robot_steps
+        self._learner_steps_before = int(learner_steps)
 
     def _service(self, role: str, service_id: str) -> Service:
         return self._services.setdefault((role, service_id), Service(role, service_id))
@@ -176,7 +178,7 @@ class RunState:
 
     @property
     def learner_steps(self) -> int:
-        return int(self._known("learner", "learner_steps"))
+        return int(self._known("learner", "learner_steps")) or self._learner_steps_before
 
     @property
     def weights_version(self) -> int:

@@ -81,9 +81,17 @@ def test_a_learner_back_at_its_checkpoint_has_that_step_and_no_negative_rate() -
 
 def test_what_earlier_processes_collected_is_added() -> None:
     state = RunState(config())
-    state.restore_collected(1_000, 2_000)
+    state.restore_counted(1_000, 2_000, 0)
     state.observe_stats(actor(5), 0)
     assert (state.env_steps, state.robot_steps) == (1_005, 2_010)
+
+
+def test_the_learners_step_is_known_before_it_is_heard_of_again() -> None:
+    state = RunState(config())
+    state.restore_counted(0, 0, 700)
+    assert state.learner_steps == 700
+    state.observe_stats(learner(650), 0)  # back at its checkpoint
+    assert state.learner_steps == 650
 
 
 def test_successes_need_a_hundred_episodes_and_keep_their_maximum() -> None:
