@@ -11,6 +11,7 @@ _COMMANDS = {
     "render": ("services.evaluator.render", "a film of evaluation episodes"),
     "report": ("services.evaluator.report", "the pictures and the film of a run"),
     "figure": ("services.evaluator.figure", "the paper's pictures of runs and controllers"),
+    "export": ("services.evaluator.export", "weights as ONNX, torch.export or TorchScript"),
     "config": ("services.configure", "print the resolved configuration"),
     "replay": ("services.replay.__main__", "serve the replay table of a run"),
     "replay inspect": ("services.replay.inspect", "what the replay log of a run holds"),

@@ -40,6 +40,7 @@ PLACES = {
     "matplotlib": ("services/dashboard",),
     "av": ("services/dashboard",),
     "tensorboardX": ("services/dashboard",),
+    "onnxruntime": ("services/evaluator/export.py",),
     "rich": (
         "services/dashboard",
         "services/train",
