@@ -68,10 +68,14 @@ def main() -> None:
     sys.stderr.write(table(found))
 
 
-def run(command: list[str]) -> dict[str, Any]:
-    """The last line of JSON that the command prints; {"error"} where it prints none."""
+def run(command: list[str], **variables: str) -> dict[str, Any]:
+    """The last line of JSON that the command prints; {"error"} where it prints none.
+
+    variables: of its environment, besides this process's.
+    """
+    environment = {**os.environ, **variables}
     ended = subprocess.run(
-        command, capture_output=True, text=True, check=False, env=dict(os.environ), timeout=1200
+        command, capture_output=True, text=True, check=False, env=environment, timeout=1200
     )
     lines = [line for line in ended.stdout.splitlines() if line.startswith("{")]
     if not lines:

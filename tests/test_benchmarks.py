@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import arena, renderer_error
+from benchmarks import arena, learner, renderer_error
 
 
 @pytest.fixture(autouse=True)
@@ -50,6 +50,34 @@ def test_arena_measures_every_part_and_the_rival(
     assert sum(s for name, s in collecting.items() if name.endswith("_share")) == pytest.approx(
         1, abs=1e-3
     )
+
+
+def test_learner_measures_updates(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    brief = ("--seconds", 0.01, "--reps", 2, "--threads", 1, "--precision", "float32")
+    result = printed(monkeypatch, capsys, learner, "--batches", 2, 4, *brief)
+    assert result["dtype"] == "torch.float32"
+    assert all(learner.figure(result, size) > 0 for size in (2, 4))
+
+
+def test_learner_and_its_peer_take_turns(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    peer = "import json, sys; print(json.dumps({'b2_updates_per_s': 32.5, 'argv': sys.argv}))"
+    (tmp_path / "bench_learner.py").write_text(peer)
+    cores = ",".join(map(str, os.sched_getaffinity(0)))
+    brief = ["--batches", "2", "--seconds", "0.01", "--reps", "2", "--threads", "1"]
+    argv = ["learner", "--peers", str(tmp_path), "--cores", cores, "--rounds", "1", *brief]
+    monkeypatch.setattr(sys, "argv", argv)
+    learner.main()
+    told = capsys.readouterr()
+    results = {line["system"]: line for line in map(json.loads, told.out.splitlines())}
+    assert list(results) == ["CleanRL, plain", "CleanRL, tuned", *learner.OURS]
+    assert "--fused" in results["CleanRL, tuned"]["argv"]
+    assert "--fused" not in results["CleanRL, plain"]["argv"]
+    assert all(learner.figure(result, 2) > 0 for result in results.values())
+    assert "CleanRL, plain          b2     32.5" in told.err
 
 
 def test_a_rival_that_ends_is_told_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
