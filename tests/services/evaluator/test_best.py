@@ -2,10 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from common.config import load_config
 from common.errors import CheckpointError
 from common.files import read_weights
+from common.network import SENT_AS, QNetwork, network_from_bytes, weights_to_bytes
+from common.policy import Policy, make_policy
 from common.trajectory import Evaluation, Weights
 from services.evaluator.__main__ import Best
 
@@ -15,8 +19,8 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "checkpoints" / "best.safetensors"
 
 
-def offer(best: Best, version: int, rate: float, frames: float) -> None:
-    result = Evaluation(
+def result(version: int, rate: float, frames: float) -> Evaluation:
+    return Evaluation(
         worker="evaluator-0",
         weights_epoch=0,
         weights_version=version,
@@ -35,7 +39,11 @@ def offer(best: Best, version: int, rate: float, frames: float) -> None:
         seed=1,
         wall_s=1.0,
     )
-    best.offer(Weights.of(0, version, 10 * version, f"weights {version}".encode()), result)
+
+
+def offer(best: Best, version: int, rate: float, frames: float) -> None:
+    weights = Weights.of(0, version, 10 * version, f"weights {version}".encode())
+    best.offer(weights, result(version, rate, frames))
 
 
 def kept(path: Path) -> str:
@@ -66,6 +74,21 @@ def test_more_successes_or_as_many_in_less_time_are_kept(
         offer(best, version, rate, frames)
         best = Best(path) if restarts else best
     assert kept(path) == f"weights {expected}"
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "float16"])
+def test_the_kept_weights_give_the_values_that_were_judged(path: Path, precision: str) -> None:
+    small = {"arena.view_px": "32", "learner.precision": "float32"}
+    judged = make_policy(load_config("smoke", small, environ={}))
+    payload = weights_to_bytes(QNetwork("duel", view_px=32), SENT_AS[precision])
+    weights = Weights.of(0, 1, 10, payload)
+    judged.adopt(weights)
+    Best(path).offer(weights, result(1, 0.5, 90))
+    kept_payload, manifest = read_weights(path)
+    assert manifest["sha256"] == weights.digest
+    states = np.random.default_rng(0).integers(0, 256, (5, 4, 32, 32), dtype=np.uint8)
+    loaded = Policy(network_from_bytes(kept_payload))
+    np.testing.assert_array_equal(loaded.q_values(states), judged.q_values(states))
 
 
 def test_of_kept_weights_nothing_is_known_where_the_file_beside_is_torn(path: Path) -> None:

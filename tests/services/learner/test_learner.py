@@ -212,6 +212,16 @@ def test_a_state_of_another_agent_is_refused(agent: AgentConfig, message: str) -
         make_learner(agent).restore(learner.state())
 
 
+def test_half_precision_is_of_what_is_published_alone() -> None:
+    halved = make_learner(learner=FLOAT32.model_copy(update={"publish_precision": "bfloat16"}))
+    exact = make_learner()
+    for step in range(3):
+        halved.step(random_batch(seed=step))
+        exact.step(random_batch(seed=step))
+    assert halved.state() == exact.state()
+    assert len(halved.payload()) < 0.51 * len(exact.payload())
+
+
 def test_diverged_weights_are_not_published() -> None:
     learner = make_learner()
     learner.step(dataclasses.replace(random_batch(), reward=torch.full((8,), torch.nan)))
