@@ -24,10 +24,12 @@ class Spread:
 class Rate:
     """Increments of one counter of one service over the last WINDOW_S seconds."""
 
-    def __init__(self, persistent: bool) -> None:
+    def __init__(self, persistent: bool, counted: float = 0.0) -> None:
         """persistent: the counter outlives its service, so when it falls (back to a checkpoint)
-        nothing was counted; otherwise it started again at 0."""
+        nothing was counted; otherwise it started again at 0. counted: of its first value, what
+        somebody counted before."""
         self._persistent = persistent
+        self._counted = counted
         self._last: float | None = None
         self._since_s = 0.0
         self._increments: deque[tuple[float, float]] = deque()
@@ -36,7 +38,7 @@ class Rate:
         """Takes the counter's value; returns what was counted since the value before."""
         if self._last is None:
             self._last, self._since_s = value, now
-            return value
+            return value - self._counted if value >= self._counted else value
         increment = value - self._last
         if increment < 0 or (restarted and not self._persistent):
             increment = 0.0 if self._persistent else value

@@ -5,7 +5,7 @@ is on its way to disk at most one `record_metrics` later; a resumed run appends.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -30,7 +30,7 @@ from services.dashboard.records import (
     read_last_metrics,
     to_line,
 )
-from services.dashboard.state import RunState
+from services.dashboard.state import COUNTERS, RunState
 from services.dashboard.stopping import StoppingRule
 from services.dashboard.summary import summary_bytes
 
@@ -96,8 +96,12 @@ class Recorder:
             state.evaluations.append(evaluation)
             rule.observe_evaluation(evaluation.evaluation)
             time_s = max(time_s, evaluation.time_s)
-        counted = (metrics.get(n, 0) for n in ("env_steps", "robot_steps", "learner_steps"))
-        state.restore_counted(*counted)
+        state.restore_counted(
+            env_steps=metrics.get("env_steps", 0),
+            robot_steps=metrics.get("robot_steps", 0),
+            learner_steps=metrics.get("learner_steps", 0),
+            by_actor=_counted(metrics),
+        )
         return time_s
 
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
@@ -194,6 +198,16 @@ def flat_metrics(state: RunState, now: float) -> dict[str, float | int | None]:
     flat.update({f"{name}_per_s": round(state.per_second(name, now), 3) for name in RATES})
     flat.update(_service_metrics(state))
     return flat
+
+
+def _counted(metrics: Mapping[str, Any]) -> dict[tuple[str, str], float]:
+    """The counters of single actors in a line of metrics, by actor and counter."""
+    names = [name.split("/") for name in metrics if name.startswith("actor/")]
+    return {
+        (actor, name): float(metrics[f"actor/{actor}/{name}"])
+        for _, actor, name in names
+        if name in COUNTERS["actor"]
+    }
 
 
 def _service_metrics(state: RunState) -> Iterator[tuple[str, float]]:

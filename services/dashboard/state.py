@@ -7,7 +7,9 @@ record an evaluation.
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from common.config import Config
 from common.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
@@ -77,6 +79,7 @@ class RunState:
         self._outcomes = bytearray()
         self._services: dict[tuple[str, str], Service] = {}
         self._collected = {"env_steps": 0.0, "robot_steps": 0.0}
+        self._counted: dict[tuple[str, str], float] = {}  # by who kept the record before
         self._learner_steps_before = 0  # until the learner of this start is heard of
 
     def __repr__(self) -> str:
@@ -97,7 +100,8 @@ class RunState:
         service.metrics, service.text = dict(stats.metrics), dict(stats.text)
         for name in COUNTERS.get(stats.role, ()):
             if name in stats.metrics:
-                rate = service.rates.setdefault(name, Rate(persistent=stats.role != "actor"))
+                earlier = self._counted.get((stats.id, name), 0.0)  # of actors only
+                rate = service.rates.setdefault(name, Rate(stats.role != "actor", earlier))
                 counted = rate.observe(stats.metrics[name], now, restarted)
                 if name in self._collected:
                     self._collected[name] += counted
@@ -133,8 +137,18 @@ class RunState:
         """A warning for the screen."""
         self.log.append(line)
 
-    def restore_counted(self, env_steps: float, robot_steps: float, learner_steps: float) -> None:
-        """Adds what actors of the run's earlier processes counted; the learner counts on itself."""
+    def restore_counted(
+        self,
+        env_steps: float,
+        robot_steps: float,
+        learner_steps: float,
+        by_actor: Mapping[tuple[str, str], float] = MappingProxyType({}),
+    ) -> None:
+        """Adds what the run's actors collected before; the learner counts on by itself.
+
+        by_actor: what is in these of actors that may be there still, by actor and counter.
+        """
+        self._counted.update(by_actor)
         self._collected["env_steps"] += env_steps
         self._collected["robot_steps"] += robot_steps
         self._learner_steps_before = int(learner_steps)

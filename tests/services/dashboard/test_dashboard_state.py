@@ -94,6 +94,14 @@ def test_the_learners_step_is_known_before_it_is_heard_of_again() -> None:
     assert state.learner_steps == 650
 
 
+def test_an_actor_that_outlived_who_kept_the_record_is_not_counted_twice() -> None:
+    state = RunState(config())
+    state.restore_counted(1_000, 2_000, 0, {("0", "env_steps"): 400, ("1", "env_steps"): 600})
+    state.observe_stats(Stats("actor", "0", {"env_steps": 450}, {}), 0)
+    state.observe_stats(Stats("actor", "1", {"env_steps": 7}, {}), 0)  # itself new
+    assert state.env_steps == 1_057
+
+
 def test_successes_need_a_hundred_episodes_and_keep_their_maximum() -> None:
     state = RunState(config())
     for number in range(99):
