@@ -23,6 +23,9 @@ from common.transport.slots import Lender
 
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _OPEN_ATTEMPT_MS = 2_000
+# How long a full link holds up its sender before it is closed. A router gives up soon: a peer that
+# is stopped would hold up all others, until they lose their leases (10 s) too.
+_PATIENCE_US = {"router": 5_000_000, "client": 60_000_000}
 
 
 class Session:
@@ -157,8 +160,9 @@ def _first_line(error: Exception) -> str:
 
 def _zenoh_config(config: TransportConfig) -> zenoh.Config:
     result = zenoh.Config()
+    mode = "router" if config.listen else "client"
     settings: dict[str, Any] = {
-        "mode": "router" if config.listen else "client",
+        "mode": mode,
         "listen/endpoints": list(config.listen),
         "connect/endpoints": list(config.connect),
         "connect/timeout_ms": _OPEN_ATTEMPT_MS,
@@ -173,7 +177,7 @@ def _zenoh_config(config: TransportConfig) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/queue/size/data": 16,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": _PATIENCE_US[mode],
         "transport/shared_memory/enabled": False,  # our own, in slots.py, has no pool to overflow
     }
     for key, value in settings.items():
