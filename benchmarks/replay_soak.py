@@ -8,11 +8,14 @@ request (milliseconds: median, p99, longest), and how much went through.
 
 import argparse
 import multiprocessing
+import multiprocessing.process
+import multiprocessing.queues
 import multiprocessing.synchronize
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,20 +68,42 @@ def soak(config: Config, arguments: argparse.Namespace, folder: Path) -> dict[st
     command = [sys.executable, "-m", "services.replay", "--run", RUN, "--listen", endpoint]
     command += ["--config", str(folder / "config.toml"), "--run-dir", str(folder)]
     spawn = multiprocessing.get_context("spawn")
-    stop = spawn.Event()
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as service, spawn.Pool(2) as pool:
+    stop, told = spawn.Event(), spawn.Queue()
+    workers = [
+        spawn.Process(target=work, args=(name, config, endpoint, stop, told)) for name in WORK
+    ]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as service:
         try:
-            inserted = pool.apply_async(insert, (config, endpoint, stop))
-            sampled = pool.apply_async(sample, (config, endpoint, stop))
-            memory = watch(service.pid, config, endpoint, arguments.minutes)
+            for worker in workers:
+                worker.start()
+            memory = watch(service.pid, config, endpoint, arguments.minutes, workers)
             stop.set()
-            return {"memory_mib": memory, "insert": inserted.get(60), "sample": sampled.get(60)}
+            return {"memory_mib": memory, **dict(told.get(timeout=60) for _ in workers)}
         finally:
             stop.set()
             service.terminate()
+            for worker in workers:
+                worker.join(60)
 
 
-def watch(process: int, config: Config, endpoint: str, minutes: float) -> dict[str, float]:
+def work(
+    name: str,
+    config: Config,
+    endpoint: str,
+    stop: multiprocessing.synchronize.Event,
+    told: "multiprocessing.queues.Queue[tuple[str, dict[str, float]]]",
+) -> None:
+    """One of WORK until told to stop; then its figures."""
+    told.put((name, WORK[name](config, endpoint, stop)))
+
+
+def watch(
+    process: int,
+    config: Config,
+    endpoint: str,
+    minutes: float,
+    workers: Sequence[multiprocessing.process.BaseProcess],
+) -> dict[str, float]:
     """Memory of the service while it is at work, from the second time round its table on."""
     transport = config.transport.model_copy(update={"connect": (endpoint,)})
     found: list[float] = []
@@ -86,6 +111,8 @@ def watch(process: int, config: Config, endpoint: str, minutes: float) -> dict[s
         told = session.queue_subscriber(Keys(RUN).every_stats)
         inserts, due_s = 0.0, time.monotonic()
         while len(found) < max(2, 60 * minutes / PERIOD_S):
+            if not all(worker.is_alive() for worker in workers):
+                raise MrcdrlError("a worker ended; its error is above")
             item = told.take(1.0)
             if item is not None:
                 inserts = decode(Stats, item[1]).metrics["inserts"]
@@ -174,6 +201,8 @@ def latencies(seconds: list[float]) -> dict[str, float]:
         "max_ms": round(float(longest), 1),
     }
 
+
+WORK = {"insert": insert, "sample": sample}
 
 if __name__ == "__main__":
     main()
