@@ -83,9 +83,10 @@ class DeviceDrawing:
 
 
 def make_drawing(config: ArenaConfig, device: torch.device) -> Drawing:
-    """On the device where it is a GPU and there is something to draw; else on the host."""
+    """On the device where it is a GPU and draws all that records hold; else on the host."""
     scenes = config.codec == "scene" and config.renderer == "analytic"
-    if device.type == "cuda" and scenes:
+    more = config.obstacle_count or config.inner_walls_px or config.pixel_noise
+    if device.type == "cuda" and scenes and not more:
         return DeviceDrawing(config, device)
     return HostDrawing(make_codec(config).decode, device)
 

@@ -129,6 +129,10 @@ def test_symmetries_act_on_both_alike(orientation: str) -> None:
         ("cuda:1", {}, DeviceDrawing),
         ("cuda", {"arena.renderer": "literal"}, HostDrawing),
         ("cuda", {"arena.codec": "frames"}, HostDrawing),
+        ("cuda", {"arena.num_targets": "3"}, DeviceDrawing),
+        ("cuda", {"arena.num_obstacles": "1"}, HostDrawing),
+        ("cuda", {"arena.inner_walls_px": "[[100, 100, 200, 100]]"}, HostDrawing),
+        ("cuda", {"arena.pixel_noise": "2.0"}, HostDrawing),
     ],
 )
 def test_a_gpu_draws_scenes_itself(
