@@ -88,7 +88,7 @@ class Vitals:
 def largest_return(config: Config) -> float:
     """A bound of what any state is worth, in scaled rewards: all that an episode may bring."""
     arena, gamma = config.arena, config.agent.gamma
-    steps = min(arena.max_frames, 1 / (1 - gamma)) if gamma < 1 else arena.max_frames
+    steps = min(arena.max_frames, 1 / (1 - gamma))
     rewards = (
         abs(arena.success_reward)
         + arena.max_collisions * abs(arena.collision_reward)

@@ -11,11 +11,11 @@ from rich.table import Table
 
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, load_config
+from common.files import RUN_CONFIG
 from services.replay.contents import log_directory, read_contents
 from services.replay.digest import digest
 from services.replay.export import write_export
 
-_CONFIG_FILE = "config.toml"
 _BAR = 32
 
 
@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _config(run: Path, source: str | None, given: dict[str, str]) -> Config | None:
     """The run's configuration; None where it has none, as one whose services came up by hand."""
-    own = run / _CONFIG_FILE
+    own = run / RUN_CONFIG
     if source is None and not given and not own.is_file():
         return None
     return load_config(source or (str(own) if own.is_file() else None), given)
