@@ -80,7 +80,8 @@ class ReplayReader:
 
     A reply is of one shard, drawn in proportion to the shards' total priorities; the
     probabilities, the table size and the keys of its samples speak of all shards together. One
-    that is away or holds back is left out until it answers.
+    that is away or holds back, for which a sample has waited `late_s` in vain, is left out until
+    it answers.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class ReplayReader:
         *,
         num_shards: int = 1,
         seed: int = 0,
+        late_s: float = _RETRY_S,
     ) -> None:
         payload = encode(SampleRequest(batch_size * batches_per_request))
         self._shards = [
@@ -110,6 +112,7 @@ class ReplayReader:
         self._batches: Iterator[Samples] = iter(())
         self._patience = _Patience("replay has not answered with a mini-batch", warn_s)
         self._rng = np.random.default_rng(seed)
+        self._late_s = late_s
         self._stop = stop
 
     @property
@@ -135,7 +138,7 @@ class ReplayReader:
         share = shares([shard.total_priority for shard in there])
         index = int(self._rng.choice(len(there), p=share)) if len(there) > 1 else 0
         drawn = there[index]
-        if not drawn.ready(_RETRY_S):
+        if not drawn.ready(self._late_s):
             drawn.late = True
             return iter(())
         try:
