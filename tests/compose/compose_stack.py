@@ -25,6 +25,10 @@ LEARNING = ("actor", "learner", "evaluator")  # whose images hold PyTorch
 T = TypeVar("T")
 
 
+class NoEngineError(Exception):
+    """There is no engine, nor can one be had; says why."""
+
+
 def works(environment: Mapping[str, str]) -> bool:
     """Whether there is an engine, with Compose."""
     try:
@@ -38,17 +42,22 @@ def works(environment: Mapping[str, str]) -> bool:
 
 
 @contextmanager
-def engine(folder: Path) -> Iterator[dict[str, str] | None]:
-    """The environment in which `docker compose` works; None where no engine can be had."""
+def engine(folder: Path) -> Iterator[dict[str, str]]:
+    """The environment in which `docker compose` works; raises NoEngineError."""
     script = os.environ.get(ENGINE_VARIABLE)
     if works(os.environ):
         yield dict(os.environ)
-    elif not script or os.geteuid() != 0:
-        yield None
+    elif not script:
+        raise NoEngineError(f"{ENGINE_VARIABLE} names none")
+    elif os.geteuid() != 0:
+        raise NoEngineError(f"only root may bring up {script}")
     else:
         home = Path(os.environ.get("ENGINE_HOME", folder / "engine"))
         environment = {**os.environ, "ENGINE_HOME": str(home)}
-        subprocess.run([script, "up"], env=environment, check=True, timeout=900)
+        try:
+            subprocess.run([script, "up"], env=environment, check=True, timeout=900)
+        except (OSError, subprocess.SubprocessError) as error:
+            raise NoEngineError(str(error)) from error
         try:
             shown = subprocess.run(
                 ["bash", "-c", '. "$ENGINE_HOME/env.sh" && env -0'],

@@ -5,11 +5,12 @@ One stack for all tests, in their order; without an engine they are skipped, and
 
 import json
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
-from tests.compose.compose_stack import ENGINE_VARIABLE, Container, Stack, engine
+from tests.compose.compose_stack import Container, NoEngineError, Stack, engine
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 SERVICES = ("router", "replay", "learner", "actor", "evaluator", "status")
@@ -21,15 +22,15 @@ AGAIN_S = 120.0  # from a fault to the next
 def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
     """The stack with its images built, not up yet; removed at the end."""
     folder = tmp_path_factory.mktemp("compose")
-    with engine(folder) as environment:
-        if environment is None:
-            pytest.skip(f"NO DOCKER ENGINE: THE STACK IS NOT TESTED ({ENGINE_VARIABLE} names one)")
+    with ExitStack() as cleanup:
+        try:
+            environment = cleanup.enter_context(engine(folder))
+        except NoEngineError as error:
+            pytest.skip(f"NO DOCKER ENGINE: THE STACK IS NOT TESTED ({error})")
         stack = Stack(environment, folder)
         stack.compose("build", timeout_s=1500)
-        try:
-            yield stack
-        finally:
-            stack.remove()
+        cleanup.callback(stack.remove)
+        yield stack
 
 
 def records(stack: Stack, name: str) -> list[dict[str, Any]]:
