@@ -16,15 +16,20 @@ WORKDIR /src
 RUN python -m venv --without-pip /opt/mrcdrl
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 
+# Without tests, highlighting of other languages, and byte code that no service reads.
 FROM installer AS small-installed
-RUN pip --python /opt/mrcdrl/bin/python install . \
+RUN pip --python /opt/mrcdrl/bin/python install --no-compile . \
  && cd /opt/mrcdrl/lib/python3*/site-packages \
- && find . -type d \( -name tests -o -path ./numpy/f2py -o -name include \) -prune -exec rm -rf {} + \
- && find . -type f \( -name '*.pyi' -o -name '*.a' \) -delete
+ && find . -type d \( -name tests -o -name include -o -path ./numpy/f2py -o -path ./numpy/distutils \) \
+      -prune -exec rm -rf {} + \
+ && find . -type f \( -name '*.pyi' -o -name '*.a' -o -name '*_tests.*.so' -o -name '_simd.*.so' \) -delete \
+ && find pygments/lexers -name '*.py' ! -name '_*.py' ! -name python.py -delete
 COPY common common
 COPY services services
 COPY configs configs
-RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
+RUN pip --python /opt/mrcdrl/bin/python install --no-compile --no-deps --force-reinstall . \
+ && /opt/mrcdrl/bin/python -c "import common.heartbeat, services.cli, services.replay.__main__, \
+      services.replay.inspect, services.router.__main__, services.train.status"
 
 FROM installer AS learning-installed
 RUN --mount=type=bind,from=wheels,target=/wheels pip --python /opt/mrcdrl/bin/python install \
