@@ -1,9 +1,9 @@
 """The table: a ring of observation records in stream order, and the transitions over them.
 
 Invariants (`check_invariants`): transition keys are consecutive, the newest `size` of all ever
-inserted; each touches `window` consecutive rows of one chunk that is whole in the ring; chunks
-share rows only where one goes on with the records that the one before it ends with. Pure: no
-clock, lock or transport.
+inserted; chunks leave whole. The records past a chunk's last transition, its tail, lie apart until
+the chunk comes that goes on with them, of the same robot; then its rows serve for both, as it
+outlives the one before. Pure: no clock, lock or transport.
 """
 
 from collections import deque
@@ -15,22 +15,25 @@ from common.errors import ConfigError, WireError
 from common.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
 from services.replay.sampler import Sampler
 
-_COLUMNS_BYTES = 8 + 1 + 4 + 4 + 1 + 8  # of one transition
+_COLUMNS_BYTES = 4 + 1 + 4 + 1 + 4 + 4 + 1 + 8  # of one transition
+_TAILS = 0.8  # kept at once for each full chunk: episodes have some 1.25 chunks, or more
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Extent:
     """Where a chunk lies."""
 
     first_key: int
     num_transitions: int
     first_row: int
-    num_rows: int
+    num_rows: int  # of the ring; a tail among them stays there
+    tail_hash: int
+    tail_row: int | None  # of a tail that lies apart
 
 
 def bytes_per_transition(window: int, chunk_length: int, record_bytes: int) -> float:
     """Memory of records and columns, by the transition; the sampler's comes on top."""
-    return record_bytes * (1 + (window - 1) / chunk_length) + _COLUMNS_BYTES
+    return record_bytes * (1 + _TAILS * (window - 1) / chunk_length) + _COLUMNS_BYTES
 
 
 class Table:
@@ -38,8 +41,9 @@ class Table:
 
     capacity: transitions. stack: records of a state. n_step: longest return; a transition
     touches a window of stack + n_step records. chunk_length: transitions of most chunks; many
-    shorter ones leave less than the capacity. record_bytes: length of one record. sampler: of the
-    same capacity, for this table alone. All memory is taken, and touched, at once.
+    that are shorter, or that no other goes on with, leave less than the capacity. record_bytes:
+    length of one record. sampler: of the same capacity, for this table alone. All memory is taken,
+    and touched, at once.
     """
 
     def __init__(
@@ -52,7 +56,11 @@ class Table:
         sampler: Sampler,
     ) -> None:
         window = stack + n_step
-        num_rows = int(capacity * (1 + (window - 1) / chunk_length)) + 2 * window
+        overlap = window - 1
+        num_ring_rows = capacity + chunk_length + overlap
+        num_rows = num_ring_rows + overlap * (int(_TAILS * capacity / chunk_length) + 1)
+        if num_rows > np.iinfo(np.int32).max:
+            raise ConfigError(f"replay.capacity {capacity} needs {num_rows} rows; lower it")
         try:
             self._rows: UInt8Array = np.full((num_rows, record_bytes), 0, np.uint8)
         except MemoryError as error:
@@ -64,13 +72,18 @@ class Table:
         self._window = window
         self._n_step = n_step
         self._in_window = np.arange(window)
-        self._start_rows = np.zeros(capacity, np.int64)
+        self._num_ring_rows = num_ring_rows
+        self._start_rows = np.zeros(capacity, np.int32)
+        self._num_own = np.zeros(capacity, np.uint8)  # rows of the window from its start
+        self._rest_rows = np.zeros(capacity, np.int32)  # where the window's other rows begin
         self._actions = np.zeros(capacity, np.uint8)
         self._rewards = np.zeros(capacity, np.float32)
         self._discounts = np.zeros(capacity, np.float32)
         self._bootstrap_offsets = np.zeros(capacity, np.uint8)
         self._weights_versions = np.zeros(capacity, np.int64)
         self._extents: deque[_Extent] = deque()
+        self._free_tails = list(range(num_ring_rows, num_rows, overlap))
+        self._waiting: dict[int, _Extent] = {}  # by the hash of their tail, which lies apart
         self._next_key = 0
         self._next_row = 0
         self._sampler = sampler
@@ -118,6 +131,8 @@ class Table:
         columns = (
             self._rows,
             self._start_rows,
+            self._num_own,
+            self._rest_rows,
             self._actions,
             self._rewards,
             self._discounts,
@@ -143,21 +158,29 @@ class Table:
     def insert(self, chunk: Chunk) -> None:
         """Append the chunk's transitions; the oldest chunks make room."""
         self.check(chunk)
-        length, num_rows = len(chunk), len(chunk.records)
-        oldest = self.first_key
-        shared = self._window - 1 if self._goes_on(chunk) else 0
-        first_row = self._make_room(length, num_rows - shared) - shared
+        length, oldest = len(chunk), self.first_key
+        while len(self) + length > self._capacity:
+            self._evict_oldest()
+        num_rows = length if self._free_tails else len(chunk.records)
+        first_row = self._make_room(num_rows)
         if self.first_key > oldest:
             self._sampler.evict(range(oldest, self.first_key))
-        self._rows[first_row + shared : first_row + num_rows] = chunk.records[shared:]
+        self._rows[first_row : first_row + num_rows] = chunk.records[:num_rows]
+        self._hand_over(chunk, first_row)
+        extent = _Extent(self._next_key, length, first_row, num_rows, 0, None)
+        rest_row = first_row + length
+        if num_rows == length:
+            rest_row = self._set_apart(extent, chunk.records[length:])
         slots = (self._next_key + np.arange(length)) % self._capacity
         self._start_rows[slots] = first_row + np.arange(length)
+        self._num_own[slots] = np.minimum(self._window, length - np.arange(length))
+        self._rest_rows[slots] = rest_row
         self._actions[slots] = chunk.actions
         self._rewards[slots] = chunk.rewards
         self._discounts[slots] = chunk.discounts
         self._bootstrap_offsets[slots] = chunk.bootstrap_offsets
         self._weights_versions[slots] = chunk.weights_version
-        self._extents.append(_Extent(self._next_key, length, first_row, num_rows))
+        self._extents.append(extent)
         self._next_key += length
         self._next_row = first_row + num_rows
         self._sampler.insert(range(self._next_key - length, self._next_key), chunk.priorities)
@@ -193,36 +216,61 @@ class Table:
             discounts=self._discounts[slots],
             bootstrap_offsets=self._bootstrap_offsets[slots],
             weights_versions=self._weights_versions[slots],
-            records=self._gather(self._start_rows[slots], out),
+            records=self._gather(slots, out),
         )
 
-    def _gather(self, start_rows: Int64Array, out: memoryview | None) -> UInt8Array:
-        """The records [B, W, R] of the windows that begin at rows [B]."""
-        rows = (start_rows[:, None] + self._in_window).reshape(-1)
+    def _window_rows(self, slots: Int64Array) -> Int64Array:
+        """Of the transitions in slots [B], int64 [B, W]."""
+        num_own = self._num_own[slots, None].astype(np.int64)
+        own = self._start_rows[slots, None] + self._in_window
+        rest = self._rest_rows[slots, None] - num_own + self._in_window
+        return np.where(self._in_window < num_own, own, rest)
+
+    def _gather(self, slots: Int64Array, out: memoryview | None) -> UInt8Array:
+        """The records [B, W, R] of the transitions in slots [B]."""
+        rows = self._window_rows(slots).reshape(-1)
         record_bytes = self._rows.shape[1]
         flat = None if out is None else np.frombuffer(out, np.uint8).reshape(-1, record_bytes)
         # "clip" writes straight into `out`; the rows are all there.
         records: UInt8Array = self._rows.take(rows, axis=0, out=flat, mode="clip")
-        return records.reshape(len(start_rows), self._window, record_bytes)
+        return records.reshape(len(slots), self._window, record_bytes)
 
-    def _goes_on(self, chunk: Chunk) -> bool:
-        """Whether the chunk begins with the records that the newest one ends with.
+    def _set_apart(self, extent: _Extent, tail: UInt8Array) -> int:
+        """Keep the chunk's tail until a chunk goes on with it; the first row where it lies."""
+        row = self._free_tails.pop()
+        self._rows[row : row + len(tail)] = tail
+        extent.tail_row, extent.tail_hash = row, hash(tail.tobytes())
+        self._waiting[extent.tail_hash] = extent
+        return row
 
-        So do two chunks of one robot when no other came between.
-        """
-        overlap, end = self._window - 1, self._next_row
-        if not self._extents or end + len(chunk.records) - overlap > len(self._rows):
-            return False
-        return np.array_equal(self._rows[end - overlap : end], chunk.records[:overlap])
+    def _hand_over(self, chunk: Chunk, first_row: int) -> None:
+        """Let the chunk that it goes on with, if there is one, use its rows from first_row."""
+        overlap = self._window - 1
+        if len(chunk) < overlap:
+            return  # its own tail would hold some of them
+        head = chunk.records[:overlap]
+        before = self._waiting.get(hash(head.tobytes()))
+        if before is None or before.tail_row is None:
+            return
+        if np.array_equal(self._rows[before.tail_row : before.tail_row + overlap], head):
+            end = before.first_key + before.num_transitions
+            keys = np.arange(max(before.first_key, end - overlap), end)
+            self._rest_rows[keys % self._capacity] = first_row
+            self._free_tail(before)
 
-    def _make_room(self, num_transitions: int, num_rows: int) -> int:
-        """Evict until both fit; the first of `num_rows` free consecutive rows."""
-        while len(self) + num_transitions > self._capacity:
-            self._extents.popleft()
+    def _free_tail(self, extent: _Extent) -> None:
+        if extent.tail_row is not None:
+            self._free_tails.append(extent.tail_row)
+            extent.tail_row = None
+            if self._waiting.get(extent.tail_hash) is extent:
+                del self._waiting[extent.tail_hash]
+
+    def _make_room(self, num_rows: int) -> int:
+        """Evict until they fit; the first of `num_rows` free consecutive rows of the ring."""
         first_row = self._next_row
-        if first_row + num_rows > len(self._rows):
+        if first_row + num_rows > self._num_ring_rows:
             # The rows up to the end stay unused this time round.
-            self._evict_rows(first_row, len(self._rows))
+            self._evict_rows(first_row, self._num_ring_rows)
             first_row = 0
         self._evict_rows(first_row, first_row + num_rows)
         return first_row
@@ -230,24 +278,34 @@ class Table:
     def _evict_rows(self, start: int, stop: int) -> None:
         # The oldest chunk is the next one ahead in the ring, so evicting in order frees them.
         while self._extents and start <= self._extents[0].first_row < stop:
-            self._extents.popleft()
+            self._evict_oldest()
+
+    def _evict_oldest(self) -> None:
+        self._free_tail(self._extents.popleft())
 
     def check_invariants(self) -> None:
         """Raise AssertionError where one of the module's invariants does not hold."""
         key = self.first_key
+        overlap = self._window - 1
         taken = np.zeros(len(self._rows), bool)
-        end = -1
         for extent in self._extents:
             if extent.first_key != key:
                 raise AssertionError(f"key {extent.first_key} follows where {key} is due")
             key += extent.num_transitions
-            first, stop = extent.first_row, extent.first_row + extent.num_rows
-            if first == end - (self._window - 1):
-                first = end
-            if taken[first:stop].any():
-                raise AssertionError("two chunks share rows, and neither goes on with the other")
-            taken[first:stop] = True
-            end = stop
+            spans = [(extent.first_row, extent.num_rows)]
+            if extent.tail_row is not None:
+                spans.append((extent.tail_row, overlap))
+            for first, length in spans:
+                if taken[first : first + length].any():
+                    raise AssertionError("two chunks lie in the same rows")
+                taken[first : first + length] = True
         if key != self._next_key or len(self) > self._capacity:
             raise AssertionError("keys are not the newest of all inserted, or exceed the capacity")
+        slots = np.arange(self.first_key, self._next_key) % self._capacity
+        if not taken[self._window_rows(slots)].all():
+            raise AssertionError("a transition touches rows of no chunk")
+        num_apart = int(taken[self._num_ring_rows :].sum()) // overlap
+        all_tails = (len(self._rows) - self._num_ring_rows) // overlap
+        if num_apart + len(self._free_tails) != all_tails:
+            raise AssertionError("a tail is neither free nor of a chunk")
         self._sampler.check_invariants(self.keys)

@@ -109,7 +109,9 @@ class TableAgainstList(RuleBasedStateMachine):
                 len(self.lengths), length, stack=self.stack, n_step=self.n_step, priorities=given
             )
             if self.model and data.draw(st.booleans()):
-                chunk = going_on(chunk, self.model[-1].records)
+                back = data.draw(st.integers(1, min(4, len(self.lengths))))  # robots take turns
+                last = len(self.model) - 1 - sum(self.lengths[len(self.lengths) - back + 1 :])
+                chunk = going_on(chunk, self.model[last].records)
             self.table.insert(chunk)
             self.priorities += given or [self.largest] * length
             self.largest = max(self.largest, *given, 0.0)
@@ -260,6 +262,31 @@ def test_one_robots_consecutive_chunks_share_their_records() -> None:
     np.testing.assert_array_equal(samples.records, expected)
 
 
+def robots_in_turns(table: Table, num_robots: int, num_chunks: int, *, follow: bool) -> None:
+    """Insert full chunks, of which each goes on with its robot's one before, or none does."""
+    robots = [np.arange(4 + 8 * num_chunks, dtype=np.uint16) for _ in range(num_robots)]
+    streams = [np.stack([np.full_like(r, i), r], 1).view(np.uint8) for i, r in enumerate(robots)]
+    for number in range(num_chunks):
+        robot, first = number % num_robots, number // num_robots * (8 if follow else 12)
+        records = streams[robot][first : first + 3 + 8 + 1]
+        table.insert(dataclasses.replace(make_chunk(number, 8), records=records))
+        table.check_invariants()
+
+
+def test_many_robots_chunks_in_turns_share_their_records() -> None:
+    sharing, apart = make_table(800), make_table(800)
+    robots_in_turns(sharing, 10, 400, follow=True)
+    robots_in_turns(apart, 10, 400, follow=False)
+    assert len(sharing) == 800
+    assert 0.9 * 800 < len(apart) < 800  # tails past those that have a place take the ring's rows
+    samples = sharing.sample(400)
+    robot, row = samples.records.view(np.uint16)[..., 0], samples.records.view(np.uint16)[..., 1]
+    number, step = samples.keys // 8, samples.keys % 8
+    np.testing.assert_array_equal(robot, np.repeat(number % 10, 5).reshape(-1, 5))
+    first = number // 10 * 8 + step
+    np.testing.assert_array_equal(row, first[:, None] + np.arange(5))
+
+
 def test_records_are_gathered_into_memory_of_the_caller() -> None:
     table = make_table(100)
     table.insert(make_chunk(1, 10))
@@ -274,8 +301,8 @@ def test_records_are_gathered_into_memory_of_the_caller() -> None:
 def test_memory_is_the_rows_and_the_columns() -> None:
     rng = np.random.default_rng(0)
     table = Table(1000, 4, 1, 50, 80, UniformSampler(rng))
-    per_transition = 8 + 1 + 4 + 4 + 1 + 8
-    assert table.nbytes == (1080 + 2 * 5) * 80 + 1000 * per_transition
+    per_transition = 4 + 1 + 4 + 1 + 4 + 4 + 1 + 8
+    assert table.nbytes == (1000 + 50 + 4 + 17 * 4) * 80 + 1000 * per_transition
     assert table.capacity == 1000
     prioritized = Table(1000, 4, 1, 50, 80, PrioritizedSampler(1000, EXPONENT, rng))
     assert prioritized.nbytes == table.nbytes + 2 * 1024 * 8
