@@ -63,7 +63,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
     num_robots, num_targets, num_obstacles = counts
     targets, obstacles = 3 * num_robots, 3 * num_robots + 2 * num_targets
     size = out.shape[1]
-    cover = np.zeros(size + 1, np.float64)
+    cover = np.zeros((_NUM_LINES, 3), np.float64)
     hand_width = 0.5 * HEADING_WIDTH_PX * scale
     for n in range(len(scenes)):
         scene = scenes[n]
@@ -177,16 +177,17 @@ def _box(view, x0, x1, y0, y1, grey):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _add_span(cover, low, high, weight):  # type: ignore[no-untyped-def]
-    """Adds to each pixel of a line weight x its part of [low, high], within [0, V]."""
-    first, last = int(low), int(high)
-    if first == last:
-        cover[first] += weight * (high - low)
-        return
-    cover[first] += weight * (first + 1 - low)
-    for i in range(first + 1, last):
-        cover[i] += weight
-    cover[last] += weight * (high - last)
+def _paint_row(row, cover, grey):  # type: ignore[no-untyped-def]
+    """Paints in a row of pixels what its scan lines cover: from low to high, with a weight each."""
+    low, high = cover[0, 0], cover[0, 1]
+    for k in range(1, _NUM_LINES):
+        low, high = min(low, cover[k, 0]), max(high, cover[k, 1])
+    for j in range(int(min(low, high)), math.ceil(high)):
+        share = 0.0
+        for k in range(_NUM_LINES):
+            part = min(j + 1.0, cover[k, 1]) - max(np.float64(j), cover[k, 0])
+            share += cover[k, 2] * max(part, 0.0)
+        row[j] = _blend(row[j], grey, min(share, 1.0))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -195,22 +196,16 @@ def _disc(view, cover, x, y, radius, grey):  # type: ignore[no-untyped-def]
     size = view.shape[0]
     if not (x + radius > 0 and x - radius < size and y + radius > 0 and y - radius < size):
         return
-    first, last = int(max(x - radius, 0.0)), math.ceil(min(x + radius, np.float64(size)))
     for i in range(int(max(y - radius, 0.0)), math.ceil(min(y + radius, np.float64(size)))):
         top = max(np.float64(i), y - radius) - y
         tall = min(i + 1.0, y + radius) - y - top
         for k in range(_NUM_LINES):
             dy = top + _NODES[k] * tall
-            square = radius * radius - dy * dy
-            if square > 0:
-                chord = math.sqrt(square)
-                low, high = max(x - chord, 0.0), min(x + chord, np.float64(size))
-                if low < high:
-                    _add_span(cover, low, high, _WEIGHTS[k] * tall)
-        for j in range(first, last):
-            view[i, j] = _blend(view[i, j], grey, min(cover[j], 1.0))
-            cover[j] = 0.0
-        cover[size] = 0.0
+            chord = math.sqrt(max(radius * radius - dy * dy, 0.0))
+            cover[k, 0] = max(x - chord, 0.0)
+            cover[k, 1] = min(x + chord, np.float64(size))
+            cover[k, 2] = _WEIGHTS[k] * tall
+        _paint_row(view[i], cover, grey)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -237,7 +232,6 @@ def _bar_across(view, cover, x, y, dx, dy, start, end, half, grey):  # type: ign
         return
     width = half / abs(dy)
     for i in range(int(max(low_y, 0.0)), math.ceil(min(high_y, np.float64(size)))):
-        first, last = size, 0
         top = max(np.float64(i), low_y) - y
         tall = min(i + 1.0, high_y) - y - top
         for k in range(_NUM_LINES):
@@ -248,11 +242,6 @@ def _bar_across(view, cover, x, y, dx, dy, start, end, half, grey):  # type: ign
                 one, other = x + (start - t * dy) / dx, x + (end - t * dy) / dx
                 low, high = max(low, min(one, other)), min(high, max(one, other))
             elif not start <= t * dy <= end:
-                continue
-            if low < high:
-                _add_span(cover, low, high, _WEIGHTS[k] * tall)
-                first, last = min(first, int(low)), max(last, math.ceil(high))
-        for j in range(first, last):
-            view[i, j] = _blend(view[i, j], grey, min(cover[j], 1.0))
-            cover[j] = 0.0
-        cover[size] = 0.0
+                high = low
+            cover[k, 0], cover[k, 1], cover[k, 2] = low, high, _WEIGHTS[k] * tall
+        _paint_row(view[i], cover, grey)
