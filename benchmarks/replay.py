@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--fsync", choices=["never", "always", "off"], default="never")
     parser.add_argument("--log-dir", help="where the log goes; by default the system's")
     parser.add_argument("--network", action="store_true", help="without shared memory")
+    parser.add_argument("--drawing-threads", type=int, default=0, help="0: one a core")
     parser.add_argument("--spool", type=int, default=8, help="chunks unacknowledged at most")
     parser.add_argument("--request", type=int, default=512, help="transitions a sample request")
     parser.add_argument("--backlog", type=int, default=64, help="batches of priorities that wait")

@@ -7,6 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ import torch
 from common.arena import make_codec
 from common.config import Config
 from common.keys import Keys
-from common.process import StopSignal
+from common.process import StopSignal, available_cores
 from common.trajectory import Chunk, Samples, UInt8Array
 from common.transport import Session
 from services.actor.sender import Sender
+from services.learner.drawing import ThreadedDecode
 from services.learner.priorities import PrioritiesSender
 from services.replay.__main__ import build, open_log
 from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
@@ -139,7 +141,9 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
 
     def begin(self, batch_size: int) -> None:
         super().begin(batch_size)
-        self._codec = make_codec(config_of(self.args).arena)
+        self._threads = ThreadPoolExecutor(self.args.drawing_threads or available_cores())
+        codec = make_codec(config_of(self.args).arena)
+        self._decode = ThreadedDecode(codec, VIEW_PX, self._threads)
         self._session = session_of(self.args, "connect")
         self._stop = StopSignal()
         batches = max(1, self.args.request // batch_size)
@@ -172,10 +176,8 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
         if self._num_given <= 3:
             # Before it starts the clock the harness looks at shape, order and greys of three
             # batches: our arena is darker than its frames.
-            return self._codec.decode(samples.records) // 2 + np.uint8(120)
-        return (
-            self._codec.decode(samples.records) if self.args.codec == "drawn" else samples.records
-        )
+            return self._decode(samples.records) // 2 + np.uint8(120)
+        return self._decode(samples.records) if self.args.codec == "drawn" else samples.records
 
     def update(self, keys: Any, priorities: Any) -> None:
         self._priorities.put(keys, torch.from_numpy(priorities))
@@ -185,4 +187,5 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
     def end(self) -> None:
         self._stop.set()
         self._priorities.close()
+        self._threads.shutdown()
         self._session.close()

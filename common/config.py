@@ -323,6 +323,8 @@ class LearnerConfig(Section):
     threads: Annotated[int, Field(ge=0)] = 0
     """Torch threads; 0: half the cores, at least 1. More than are really free make a step far
     slower, because threads wait for one another. (ours)"""
+    drawing_threads: Annotated[int, Field(ge=0)] = 0
+    """Threads that share the drawing of a large batch where the CPU draws; 0: one a core. (ours)"""
     prefetch_batches: Count = 8
     """Batches decoded ahead of the step. (ours)"""
     requests_in_flight: Count = 4

@@ -3,6 +3,7 @@
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 
 import torch
@@ -59,8 +60,14 @@ def main(argv: Sequence[str]) -> int:
             num_shards=config.replay.shards,
             seed=settings.seed,
         )
+        drawing_threads = ThreadPoolExecutor(
+            settings.drawing_threads or available_cores(), "drawing"
+        )
         prefetcher = Prefetcher(
-            reader, make_collate(config, learner), settings.prefetch_batches, stop
+            reader,
+            make_collate(config, learner, drawing_threads),
+            settings.prefetch_batches,
+            stop,
         )
         priorities = None
         if config.replay.prioritized:
@@ -79,6 +86,7 @@ def main(argv: Sequence[str]) -> int:
         finally:
             stop.set()
             prefetcher.close()
+            drawing_threads.shutdown()
             if priorities is not None:
                 priorities.close()
             writer.close()
@@ -123,10 +131,12 @@ def run(
     _LOG.info("stopped at learner step %d", learner.learner_step)
 
 
-def make_collate(config: Config, learner: Learner) -> Callable[[Samples], Batch]:
-    """From samples to the batch of one step, pictures drawn."""
+def make_collate(
+    config: Config, learner: Learner, drawing_threads: Executor | None = None
+) -> Callable[[Samples], Batch]:
+    """From samples to the batch of one step, pictures drawn; by these threads if given."""
     symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
-    drawing = make_drawing(config.arena, learner.device)
+    drawing = make_drawing(config.arena, learner.device, drawing_threads)
 
     def collate_now(samples: Samples) -> Batch:
         return collate(

@@ -11,13 +11,14 @@ picture that holds a shape.
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from common.arena import Symmetry, make_codec
+from common.arena import ObservationCodec, Symmetry, make_codec
 from common.arena.views import (
     HEADING_GREY,
     HEADING_WIDTH_PX,
@@ -30,6 +31,8 @@ from common.trajectory import Int64Array, UInt8Array
 
 Turns = Sequence[tuple[Symmetry, Int64Array]]
 """Symmetries, each with the rows of the batch it was drawn for."""
+
+_BLOCK_PICTURES = 256  # that a thread draws at a time, some 0.7 ms; so few are not worth a second
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)  # scan lines a row, as on the host
 
@@ -59,6 +62,30 @@ class HostDrawing:
         return torch.from_numpy(pictures).to(self._device)
 
 
+class ThreadedDecode:
+    """A codec's `decode` for large batches: block by block, by several threads."""
+
+    def __init__(self, codec: ObservationCodec, view_px: int, threads: Executor) -> None:
+        self._decode = codec.decode
+        self._view_px = view_px
+        self._threads = threads
+
+    def __call__(self, records: UInt8Array) -> UInt8Array:
+        """Pictures uint8 [..., V, V] of records [..., R]."""
+        flat = records.reshape(-1, records.shape[-1])
+        if len(flat) <= _BLOCK_PICTURES:
+            return self._decode(records)
+        pictures = np.empty((len(flat), self._view_px, self._view_px), np.uint8)
+
+        def decode_block(start: int) -> None:
+            block = slice(start, start + _BLOCK_PICTURES)
+            self._decode(flat[block], pictures[block])
+
+        for _ in self._threads.map(decode_block, range(0, len(flat), _BLOCK_PICTURES)):
+            pass  # an error of a block is raised here
+        return pictures.reshape(*records.shape[:-1], *pictures.shape[1:])
+
+
 class DeviceDrawing:
     """Sends the scenes' records to the device, a fraction of the bytes, and draws there."""
 
@@ -82,13 +109,21 @@ class DeviceDrawing:
         return pictures
 
 
-def make_drawing(config: ArenaConfig, device: torch.device) -> Drawing:
-    """On the device where it is a GPU and draws all that records hold; else on the host."""
+def make_drawing(
+    config: ArenaConfig, device: torch.device, threads: Executor | None = None
+) -> Drawing:
+    """On the device where it is a GPU and draws all that records hold; else on the host.
+
+    threads: that draw on the host; the caller's own if None.
+    """
     scenes = config.codec == "scene" and config.renderer == "analytic"
     more = config.obstacle_count or config.inner_walls_px or config.pixel_noise
     if device.type == "cuda" and scenes and not more:
         return DeviceDrawing(config, device)
-    return HostDrawing(make_codec(config).decode, device)
+    codec = make_codec(config)
+    if threads is None:
+        return HostDrawing(codec.decode, device)
+    return HostDrawing(ThreadedDecode(codec, config.view_px, threads), device)
 
 
 def turned(pictures: Tensor, symmetry: Symmetry) -> Tensor:

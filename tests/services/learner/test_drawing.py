@@ -1,5 +1,7 @@
 """Pictures drawn by torch are those of the host, symmetries included; here on the CPU's tensors."""
 
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from itertools import product
 from typing import Any
 
@@ -12,7 +14,7 @@ from hypothesis import strategies as st
 from common.arena import Scene, Symmetry, make_codec
 from common.config import ArenaConfig, load_config
 from common.trajectory import UInt8Array
-from services.learner.drawing import DeviceDrawing, HostDrawing, make_drawing
+from services.learner.drawing import DeviceDrawing, HostDrawing, ThreadedDecode, make_drawing
 
 EVERY = [Symmetry(*flags) for flags in product((False, True), repeat=3)]
 
@@ -141,3 +143,27 @@ def test_a_gpu_draws_scenes_itself(
     monkeypatch.setattr("services.learner.drawing.DeviceViews", lambda *_: None)
     arena = load_config("quick", overrides, {}).arena
     assert type(make_drawing(arena, torch.device(device))) is expected
+
+
+@pytest.fixture
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(3) as pool:
+        yield pool
+
+
+@pytest.mark.parametrize("codec", ["scene", "frames"])
+@pytest.mark.parametrize("num_scenes", [0, 1, 128, 129, 400])
+def test_threads_draw_the_same_pictures(threads: Executor, codec: str, num_scenes: int) -> None:
+    config = ArenaConfig.model_validate({"num_robots": 2, "codec": codec})
+    given = records(config, max(num_scenes, 1))[:num_scenes]
+    given.flags.writeable = False  # as they come off the wire
+    alone = make_drawing(config, torch.device("cpu"))(given, ())
+    shared = make_drawing(config, torch.device("cpu"), threads)(given, ())
+    assert shared.shape == alone.shape == (num_scenes, 2, 60, 60)
+    assert torch.equal(shared, alone)
+
+
+def test_an_error_in_a_thread_is_raised(threads: Executor) -> None:
+    codec = make_codec(ArenaConfig(num_robots=2))
+    with pytest.raises(ValueError, match="records are"):
+        ThreadedDecode(codec, 60, threads)(np.zeros((600, 1), np.uint8))
