@@ -49,9 +49,7 @@ class Orca:
             self._assignment = shortest_assignment(scene)
         places = scene.robots[:, :2]
         wishes = self._wishes(scene.targets[self._assignment] - places)
-        self._velocities = np.stack(
-            [self._nearest(wish, *self._half_planes(i, places)) for i, wish in enumerate(wishes)]
-        )
+        self._velocities = self._nearest(wishes, *self._half_planes(places))
         speeds = np.linalg.norm(self._velocities, axis=1)
         towards = actions_towards(scene.robots[:, 2], bearings_rad(self._velocities), self._config)
         return np.where(speeds < _SLOW * self._config.step_px, np.uint8(LEFT), towards)
@@ -64,28 +62,37 @@ class Orca:
         )
         return wishes
 
-    def _half_planes(self, i: int, places: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Normals [N, 2] and bounds [N] of robot i, for the others and the walls."""
-        others = np.arange(len(places)) != i
+    def _half_planes(self, places: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Normals [K, N, 2] and bounds [K, N] of each robot, for the others and the walls."""
+        num = len(places)
+        others = np.nonzero(~np.eye(num, dtype=bool))[1].reshape(num, num - 1)
         normals, bounds = self._from_robots(
-            places[others] - places[i], self._velocities[i], self._velocities[others]
+            places[others] - places[:, None],
+            self._velocities[:, None],
+            self._velocities[others],
         )
         walls = np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
-        gaps = np.concatenate([places[i] - self._low, self._high - places[i]])
-        return np.concatenate([normals, walls]), np.concatenate([bounds, -gaps / _HORIZON_FRAMES])
+        gaps = np.concatenate([places - self._low, self._high - places], axis=1)
+        return (
+            np.concatenate([normals, np.broadcast_to(walls, (num, 4, 2))], axis=1),
+            np.concatenate([bounds, -gaps / _HORIZON_FRAMES], axis=1),
+        )
 
     def _from_robots(
         self, apart: Float64Array, own: Float64Array, velocities: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Of others at `apart` [M, 2]: each side takes half of the least change that avoids."""
+        """Of others at `apart` [K, K - 1, 2]: each side takes half of the least change that avoids.
+
+        own: velocities [K, 1, 2].
+        """
         relative = own - velocities
         reach = 2 * self._radius
-        distances = np.linalg.norm(apart, axis=1)
+        distances = np.linalg.norm(apart, axis=2)
         overlap = distances <= reach
         # The cut-off disc: of the velocities that touch within the horizon, or at once if they do.
-        horizon = np.where(overlap, 1.0, _HORIZON_FRAMES)[:, None]
+        horizon = np.where(overlap, 1.0, _HORIZON_FRAMES)[..., None]
         from_disc = relative - apart / horizon
-        disc_way = np.linalg.norm(from_disc, axis=1, keepdims=True)
+        disc_way = np.linalg.norm(from_disc, axis=2, keepdims=True)
         disc_normal = from_disc / np.maximum(disc_way, 1e-9)
         disc_change = (reach / horizon - disc_way) * disc_normal
         # The legs of the cone, on the side where the relative velocity lies.
@@ -93,25 +100,30 @@ class Orca:
         bearing = bearings_rad(apart)
         half = np.arcsin(np.clip(reach / np.maximum(distances, 1e-9), -1, 1))
         leg = directions(bearing + side * half)
-        leg_normal = side[:, None] * np.stack([-leg[:, 1], leg[:, 0]], axis=1)
-        leg_change = (relative * leg).sum(axis=1, keepdims=True) * leg - relative
-        along = (from_disc * apart).sum(axis=1)
-        on_disc = overlap | ((along < 0) & (along**2 > (reach * disc_way[:, 0]) ** 2))
-        normals = np.where(on_disc[:, None], disc_normal, leg_normal)
-        changes = np.where(on_disc[:, None], disc_change, leg_change)
-        bounds = (normals * (own + changes / 2)).sum(axis=1)
+        leg_normal = side[..., None] * np.stack([-leg[..., 1], leg[..., 0]], axis=-1)
+        leg_change = (relative * leg).sum(axis=2, keepdims=True) * leg - relative
+        along = (from_disc * apart).sum(axis=2)
+        on_disc = overlap | ((along < 0) & (along**2 > (reach * disc_way[..., 0]) ** 2))
+        normals = np.where(on_disc[..., None], disc_normal, leg_normal)
+        changes = np.where(on_disc[..., None], disc_change, leg_change)
+        bounds = (normals * (own + changes / 2)).sum(axis=2)
         return normals, bounds
 
     def _nearest(
-        self, wish: Float64Array, normals: Float64Array, bounds: Float64Array
+        self, wishes: Float64Array, normals: Float64Array, bounds: Float64Array
     ) -> Float64Array:
         """Of the velocities tried that break the half-planes least, the nearest to the wish."""
-        tried = np.concatenate([wish[None], self._tried])
-        broken = np.maximum(bounds - tried @ normals.T, 0).max(axis=1)
-        away = np.linalg.norm(tried - wish, axis=1)
-        nearest: Float64Array = tried[np.lexsort((away, np.round(broken, 3)))[0]]
+        num = len(wishes)
+        tried = np.concatenate(
+            [wishes[:, None], np.broadcast_to(self._tried, (num, *self._tried.shape))], axis=1
+        )
+        broken = (bounds[:, :, None] - normals @ tried.transpose(0, 2, 1)).max(axis=1)
+        broken = np.round(np.maximum(broken, 0), 3)
+        away = np.linalg.norm(tried - wishes[:, None], axis=2)
+        away[broken > broken.min(axis=1, keepdims=True)] = np.inf
+        nearest: Float64Array = tried[np.arange(num), away.argmin(axis=1)]
         return nearest
 
 
 def _cross(a: Float64Array, b: Float64Array) -> Float64Array:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
