@@ -23,7 +23,9 @@ LIMIT = 0.5  # grey levels
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--crops", nargs="+", type=float, default=[150, 200, 300, 400, 600, 800])
+    parser.add_argument(
+        "--crops", nargs="+", type=float, default=[60, 100, 150, 200, 300, 400, 600, 800]
+    )
     parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--scenes", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)

@@ -1,10 +1,11 @@
 """Draws every robot's picture straight from poses: the area each shape covers of each pixel.
 
 Invariants: a picture pixel is the mean over its square of crop_px / view_px arena pixels; the
-window is centred exactly on the robot; shapes are painted over one another in the order walls,
-obstacles, targets, robots, headings on a black floor, and black lies outside the arena. Coordinates
-are continuous (pixel i covers [i, i + 1)), so a mapped scene gives the mapped picture. Records of
-any bytes give some picture: what is not finite is not drawn.
+window is centred exactly on the robot where it turns with it, and else cuts out whole pixels of the
+arena, as the literal pipeline does; targets fill whole pixels in both. Shapes are painted over one
+another in the order walls, obstacles, targets, robots, headings on a black floor, and black lies
+outside the arena. Coordinates are continuous (pixel i covers [i, i + 1)), so a mapped scene gives
+the mapped picture. Records of any bytes give some picture: what is not finite is not drawn.
 """
 
 import math
@@ -22,6 +23,10 @@ TARGET_GREY = 29
 ROBOT_GREY = 255
 HEADING_GREY = 0
 HEADING_WIDTH_PX = 2.0
+# What OpenCV paints of whole pixels, in the mean over places and directions:
+HEADING_HALF_PX = 1.475  # half the width of the line of HEADING_WIDTH_PX
+HEADING_CAP_PX = 1.0  # of the line, beyond the robot's centre and rim
+DISC_LOSS_PX = 0.04  # of a radius of 15 to 40 px
 _NUM_LINES = 4  # scan lines a row of pixels, at Gauss-Legendre nodes: 5 grey levels off at most
 _LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(_NUM_LINES)
 _NODES, _WEIGHTS = (_LEGENDRE_NODES + 1) / 2, _LEGENDRE_WEIGHTS / 2  # on [0, 1]
@@ -38,8 +43,8 @@ class AnalyticViews:
         outer = config.wall_offset_px
         self._scale = scale
         self._wall = (outer, outer + config.wall_thickness_px, float(config.size_px))
-        self._target_half = config.target_size_px / 2 * scale
-        self._radius = config.robot_radius_px * scale
+        self._halves_px = (config.crop_px / 2, config.target_size_px / 2)
+        self._radius = max(config.robot_radius_px - DISC_LOSS_PX, 0.0) * scale
 
     def draw(self, scenes: Float32Array, out: UInt8Array) -> None:
         """Fills out [N, V, V] from scenes [N, 3 K + 2 M + 3 O] of SceneCodec."""
@@ -51,20 +56,23 @@ class AnalyticViews:
             self._scale,
             self._wall,
             self._inner_walls,
-            self._target_half,
+            self._halves_px,
             self._radius,
         )
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _draw_views(  # type: ignore[no-untyped-def]
-    scenes, out, counts, heading_up, scale, wall, inner_walls, target_half, radius
+    scenes, out, counts, heading_up, scale, wall, inner_walls, halves_px, radius
 ):
     num_robots, num_targets, num_obstacles = counts
     targets, obstacles = 3 * num_robots, 3 * num_robots + 2 * num_targets
     size = out.shape[1]
     cover = np.zeros((_NUM_LINES, 3), np.float64)
-    hand_width = 0.5 * HEADING_WIDTH_PX * scale
+    crop_half_px, target_half_px = halves_px
+    target_half = target_half_px * scale
+    hand_half, cap = HEADING_HALF_PX * scale, HEADING_CAP_PX * scale
+    reach = radius + cap
     for n in range(len(scenes)):
         scene = scenes[n]
         view = out[n]
@@ -74,6 +82,8 @@ def _draw_views(  # type: ignore[no-untyped-def]
         c, s = 1.0, 0.0
         if heading_up:
             c, s = -math.sin(scene[2]), -math.cos(scene[2])
+        else:
+            own_x, own_y = _on_grid(own_x, crop_half_px), _on_grid(own_y, crop_half_px)
         # places map to (c x - s y, s x + c y) about the robot
         if heading_up:
             _walls_slanted(view, cover, own_x, own_y, c, s, scale, wall)
@@ -82,9 +92,10 @@ def _draw_views(  # type: ignore[no-untyped-def]
         _inner_walls(view, cover, own_x, own_y, c, s, scale, inner_walls)
         for j in range(obstacles, obstacles + 3 * num_obstacles, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
-            _disc(view, cover, x, y, np.float64(scene[j + 2]) * scale, OBSTACLE_GREY)
+            _disc(view, cover, x, y, (scene[j + 2] - DISC_LOSS_PX) * scale, OBSTACLE_GREY)
         for j in range(targets, obstacles, 2):
-            x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
+            x, y = _on_grid(scene[j], target_half_px), _on_grid(scene[j + 1], target_half_px)
+            x, y = _map(x - own_x, y - own_y, c, s, scale, size)
             if heading_up:
                 _bar(view, cover, x, y, c, s, -target_half, target_half, target_half, TARGET_GREY)
             else:
@@ -101,10 +112,16 @@ def _draw_views(  # type: ignore[no-untyped-def]
             _disc(view, cover, x, y, radius, ROBOT_GREY)
         for j in range(0, 3 * num_robots, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
-            if -radius < x < size + radius and -radius < y < size + radius:
+            if -reach < x < size + reach and -reach < y < size + reach:
                 cos, sin = math.cos(scene[j + 2]), math.sin(scene[j + 2])
                 across, along = c * cos - s * sin, s * cos + c * sin
-                _bar(view, cover, x, y, across, along, 0.0, radius, hand_width, HEADING_GREY)
+                _bar(view, cover, x, y, across, along, -cap, reach, hand_half, HEADING_GREY)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _on_grid(middle, half):  # type: ignore[no-untyped-def]
+    """The middle of the square, half to either side, once its edges lie between pixels."""
+    return np.rint(np.float64(middle) - half) + half
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

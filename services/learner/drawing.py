@@ -20,8 +20,10 @@ from torch import Tensor
 
 from common.arena import ObservationCodec, Symmetry, make_codec
 from common.arena.views import (
+    DISC_LOSS_PX,
+    HEADING_CAP_PX,
     HEADING_GREY,
-    HEADING_WIDTH_PX,
+    HEADING_HALF_PX,
     ROBOT_GREY,
     TARGET_GREY,
     WALL_GREY,
@@ -144,8 +146,9 @@ class DeviceViews:
         self._scale = config.view_px / config.crop_px
         self._near = config.wall_offset_px, config.wall_offset_px + config.wall_thickness_px
         self._far = config.size_px - self._near[0], config.size_px - self._near[1]
-        self._target_half = config.target_size_px / 2 * self._scale
-        self._radius = config.robot_radius_px * self._scale
+        self._crop_half_px = config.crop_px / 2
+        self._target_half_px = config.target_size_px / 2
+        self._radius = max(config.robot_radius_px - DISC_LOSS_PX, 0.0) * self._scale
         self._nodes = torch.tensor((_NODES + 1) / 2, device=device)
         self._weights = torch.tensor(_WEIGHTS / 2, device=device)
 
@@ -159,25 +162,27 @@ class DeviceViews:
         # places map to (c x - s y, s x + c y) about the robot
         if self._upright:
             c, s = torch.ones_like(own[:, 0]), torch.zeros_like(own[:, 0])
+            own = _on_grid(own, self._crop_half_px)
         else:
             c, s = -sin[:, 0], -cos[:, 0]
         canvas = scenes.new_zeros(len(scenes), self._size**2)
         self._walls(canvas, own, c, s)
-        half, radius = self._target_half, self._radius
+        half = self._target_half_px * self._scale
         for j in range(split, scenes.shape[1], 2):
-            x, y = self._map(places[:, j : j + 2] - own, c, s)
+            x, y = self._map(_on_grid(places[:, j : j + 2], self._target_half_px) - own, c, s)
             self._bar(canvas, (x, y), (c, s), (-half, half), half, TARGET_GREY, self._upright)
         robots = [
             self._map(places[:, 3 * k : 3 * k + 2] - own, c, s) for k in range(self._num_robots)
         ]
         for x, y in robots:
             self._disc(canvas, x, y)
+        cap, hand_half = HEADING_CAP_PX * self._scale, HEADING_HALF_PX * self._scale
+        reach = self._radius + cap
         for k, (x, y) in enumerate(robots):
             ahead = c * cos[:, k] - s * sin[:, k], s * cos[:, k] + c * sin[:, k]
-            seen = self._sees(x) & self._sees(y)
+            seen = self._sees(x, reach) & self._sees(y, reach)
             x, y = x.where(seen, torch.nan), y.where(seen, torch.nan)
-            hand = 0.5 * HEADING_WIDTH_PX * self._scale
-            self._bar(canvas, (x, y), ahead, (0.0, radius), hand, HEADING_GREY, upright=False)
+            self._bar(canvas, (x, y), ahead, (-cap, reach), hand_half, HEADING_GREY, upright=False)
         return canvas.to(torch.uint8).reshape(-1, self._size, self._size)
 
     def _map(self, gaps: Tensor, c: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -186,8 +191,8 @@ class DeviceViews:
         middle = 0.5 * self._size
         return (c * x - s * y) * self._scale + middle, (s * x + c * y) * self._scale + middle
 
-    def _sees(self, at: Tensor) -> Tensor:
-        return (at > -self._radius) & (at < self._size + self._radius)
+    def _sees(self, at: Tensor, reach: float) -> Tensor:
+        return (at > -reach) & (at < self._size + reach)
 
     def _walls(self, canvas: Tensor, own: Tensor, c: Tensor, s: Tensor) -> None:
         """Top and bottom from corner to corner, left and right between them."""
@@ -272,6 +277,11 @@ class DeviceViews:
         at = pixels.flatten(1)
         value = canvas.gather(1, at)
         canvas.scatter_(1, at, (value + (grey - value) * share.flatten(1) + 0.5).floor())
+
+
+def _on_grid(middles: Tensor, half: float) -> Tensor:
+    """The middles of squares, half to either side, once their edges lie between pixels."""
+    return (middles - half).round() + half
 
 
 def _share(low: Tensor, high: Tensor, tall: Tensor, columns: Tensor) -> Tensor:
