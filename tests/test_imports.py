@@ -41,6 +41,7 @@ PLACES = {
     "av": ("services/dashboard",),
     "tensorboardX": ("services/dashboard",),
     "onnxruntime": ("services/evaluator/export.py",),
+    "rerun": ("services/evaluator/recording.py",),
     "rich": (
         "services/dashboard",
         "services/train",

@@ -1,4 +1,4 @@
-"""`mrcdrl render`: a film of evaluation episodes, the robots' own views beside the arena."""
+"""`mrcdrl render`: evaluation episodes as a film or, for rerun's viewer, as a recording."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 from common.arena import test_starts
 from services.dashboard.film import check_suffix, write_film
 from services.evaluator.film import film_frames
+from services.evaluator.recording import SUFFIX, check_rerun, write_recording
 from services.evaluator.subject import subject, subject_parser
 from services.evaluator.trial import play
 
@@ -13,20 +14,27 @@ FPS = 30
 
 
 def main(argv: Sequence[str]) -> int:
-    """Write the film; the exit code."""
+    """Write the film or recording; the exit code."""
     parser = subject_parser("render", "A film of evaluation episodes.")
     parser.add_argument(
-        "--out", type=Path, default=Path("film.mp4"), help="the .mp4 or .gif to write"
+        "--out", type=Path, default=Path("film.mp4"), help=f"the .mp4, .gif or {SUFFIX} to write"
     )
     parser.add_argument("--episodes", type=int, default=4, help="episodes to show")
     parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
     arguments = parser.parse_args(argv)
     if arguments.episodes < 1:
         parser.error(f"--episodes {arguments.episodes}: at least 1")
-    check_suffix(arguments.out)
+    recorded = arguments.out.suffix == SUFFIX
+    if recorded:
+        check_rerun()
+    else:
+        check_suffix(arguments.out)
     shown = subject(arguments)
     arena = shown.config.arena
     starts = test_starts(arena, arguments.episodes, arguments.seed)
-    results = play(arena, starts, shown.player(arguments.seed), keep_paths=True)
-    write_film(arguments.out, film_frames(arena, results or []), FPS)
+    results = play(arena, starts, shown.player(arguments.seed), keep_paths=True) or []
+    if recorded:
+        write_recording(arguments.out, arena, results)
+    else:
+        write_film(arguments.out, film_frames(arena, results), FPS)
     return 0
