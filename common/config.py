@@ -306,6 +306,8 @@ class ActorConfig(Section):
     """Chunks waiting to be acknowledged before the arenas stop: nothing is dropped. (ours)"""
     warn_s: Positive = 10.0
     """Without an acknowledgement for so long, the actor says whom it waits for. (ours)"""
+    device: str = "cpu"
+    """That chooses the actions; `auto`: cuda if there is one, else cpu. (ours)"""
     threads: Count = 1
     """Torch threads. (ours)"""
 
@@ -320,9 +322,14 @@ class LearnerConfig(Section):
     where the processor computes in it. (ours)"""
     device: str = "auto"
     """`auto`: cuda if there is one, else cpu. (ours)"""
+    step: Literal["auto", "eager", "graph"] = "auto"
+    """`eager`: operation after operation. `graph`: recorded once as a CUDA graph, then replayed.
+    `auto`: graph on a GPU where that works, eager elsewhere; the log says which. (ours)"""
+    updates_per_launch: Count = 4
+    """Updates that one launch of a graph makes where so many batches are ready and none of
+    target_period, publish_period and run.learner_steps falls between them. (ours)"""
     threads: Annotated[int, Field(ge=0)] = 0
-    """Torch threads; 0: half the cores, at least 1. More than are really free make a step far
-    slower, because threads wait for one another. (ours)"""
+    """Threads that share a batch on a CPU; 0: half the cores, at least 1. (ours)"""
     drawing_threads: Annotated[int, Field(ge=0)] = 0
     """Threads that share the drawing of a large batch where the CPU draws; 0: one a core. (ours)"""
     prefetch_batches: Count = 8

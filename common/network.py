@@ -10,6 +10,7 @@ Shapes: B = states of a batch, S = pictures stacked in a state, V = width of a p
 
 import json
 import struct
+from collections.abc import Sequence
 from typing import Final, Literal, TypeGuard
 
 import torch
@@ -50,6 +51,22 @@ def precision(setting: Precision, device: str | torch.device = "cpu") -> torch.d
     else:
         native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
     return torch.bfloat16 if native else torch.float32
+
+
+def resolve_device(setting: str, name: str) -> torch.device:
+    """`auto`: cuda if there is one, else cpu. name: of the setting.
+
+    Raises ConfigError for a device that is none.
+    """
+    if setting == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(setting)
+    except RuntimeError as error:
+        raise ConfigError(f"{name} {setting!r} is no device; use auto or cpu") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"{name} {setting!r}: no CUDA device here; use auto or cpu")
+    return device
 
 
 def feature_size(view_px: int) -> int:
@@ -123,6 +140,23 @@ class QNetwork(nn.Module):
             if not name.startswith(_OUTPUTS):
                 operands[name] = parameter.to(self.compute_dtype)
         return operands
+
+    def set_gradients(self, of_operands: Sequence[tuple[Tensor, ...]]) -> None:
+        """Make the sums of these the gradients of the parameters, written in place.
+
+        of_operands: for each part of a batch the gradients of what `operands` returned.
+        """
+        for parameter in self.parameters():
+            if parameter.grad is None:
+                parameter.grad = torch.empty_like(parameter)
+        gradients = [
+            parameter.grad for parameter in self.parameters() if parameter.grad is not None
+        ]
+        first, *others = of_operands
+        torch._foreach_copy_(gradients, first)
+        for other in others:
+            torch._foreach_add_(gradients, other)
+        gradients[0] /= _WHITE  # as the operand is the parameter over it
 
     def evaluate(
         self, states: Tensor, operands: Operands, seen: list[Tensor] | None = None

@@ -83,15 +83,15 @@ class Policy:
         return Selection(actions=actions, q_values=values, greedy_q=values.max(axis=1))
 
 
-def make_policy(config: Config) -> Policy:
-    """A policy of the configured network on the CPU, its parameters still to be adopted."""
+def make_policy(config: Config, device: str | torch.device = "cpu") -> Policy:
+    """A policy of the configured network on a device, its parameters still to be adopted."""
     network = QNetwork(
         config.agent.kind,
         stack=config.arena.stack,
         view_px=config.arena.view_px,
-        compute_dtype=precision(config.learner.precision),
+        compute_dtype=precision(config.learner.precision, device),
     )
-    return Policy(network)
+    return Policy(network.to(device))
 
 
 class FrameStack:

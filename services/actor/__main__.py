@@ -13,6 +13,7 @@ from common.arena import make_arenas, make_codec
 from common.config import Config
 from common.errors import CheckpointError
 from common.exploration import epsilons
+from common.network import resolve_device
 from common.policy import Policy, make_policy
 from common.process import (
     STOP_DEADLINE_S,
@@ -75,7 +76,7 @@ class Actor:
         self._reporter = StatsReporter(
             session.publisher(keys.stats("actor", worker)), "actor", worker
         )
-        self._policy = make_policy(config)
+        self._policy = make_policy(config, resolve_device(config.actor.device, "actor.device"))
         self._collector = make_collector(config, worker, self._policy)
         self._adopted_s = time.monotonic()
         self._epsilons = self._explore()

@@ -29,6 +29,7 @@ from services.learner.learner import Learner
 from services.learner.meter import Meter
 from services.learner.prefetch import Prefetcher
 from services.learner.priorities import PrioritiesSender
+from services.learner.transfer import beside_the_step
 from services.learner.vitals import Vitals
 from services.replay.client import PriorityWriter, ReplayReader
 
@@ -44,10 +45,16 @@ def main(argv: Sequence[str]) -> int:
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
         config = fetch_config(session, joining, stop)
         settings = config.learner
-        torch.set_num_threads(settings.threads or max(1, available_cores() // 2))
+        torch.set_num_threads(1)  # threads share batches, not operations
+        threads = settings.threads or max(1, available_cores() // 2)
         learner = Learner(
-            config.agent, settings, stack=config.arena.stack, view_px=config.arena.view_px
+            config.agent,
+            settings,
+            stack=config.arena.stack,
+            view_px=config.arena.view_px,
+            threads=threads,
         )
+        torch.backends.cudnn.benchmark = True  # batches are of one size
         keeper = Keeper(config, learner, joining.run_dir / "checkpoints")
         reader = ReplayReader(
             bulk,
@@ -80,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
             session.publisher(keys.stats("learner", worker)), "learner", worker
         )
         session.announce(keys.live("learner", worker))
-        _LOG.info("%s, %d threads", learner, torch.get_num_threads())
+        _LOG.info("%s", learner)
         try:
             run(config, learner, prefetcher, priorities, writer, keeper, reporter, stop)
         finally:
@@ -113,13 +120,15 @@ def run(
     try:
         writer.publish(keeper.next_weights())
         while not stop.is_set() and (not limit or learner.learner_step < limit):
-            batch = meter.timed("data_wait", lambda: prefetcher.next(_POLL_S))
-            reporter.worked(prefetcher.heard_s if batch is None else None)
-            if batch is not None:
-                update = meter.timed("step", partial(learner.step, batch))
-                meter.last = (batch, update)
+            most = min(learner.updates_per_launch, _steps_to_next_stop(config, learner))
+            batches = meter.timed("data_wait", partial(prefetcher.next, _POLL_S, most))
+            reporter.worked(None if batches else prefetcher.heard_s)
+            if batches:
+                updates = meter.timed("step", partial(learner.steps, batches))
+                meter.last = (batches[-1], updates[-1])
                 if priorities is not None:
-                    priorities.put(batch.keys, update.td_errors)
+                    for batch, update in zip(batches, updates, strict=True):
+                        priorities.put(batch.keys, update.td_errors)
                 if learner.learner_step % config.learner.publish_period == 0:
                     meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
                 meter.timed("checkpoint", keeper.maybe_save)
@@ -131,6 +140,13 @@ def run(
     _LOG.info("stopped at learner step %d", learner.learner_step)
 
 
+def _steps_to_next_stop(config: Config, learner: Learner) -> int:
+    """Until weights are to be published or the run ends."""
+    steps = config.learner.publish_period - learner.learner_step % config.learner.publish_period
+    limit = config.run.learner_steps
+    return min(steps, limit - learner.learner_step) if limit else steps
+
+
 def make_collate(
     config: Config, learner: Learner, drawing_threads: Executor | None = None
 ) -> Callable[[Samples], Batch]:
@@ -138,7 +154,7 @@ def make_collate(
     symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
     drawing = make_drawing(config.arena, learner.device, drawing_threads)
 
-    def collate_now(samples: Samples) -> Batch:
+    def collated(samples: Samples) -> Batch:
         return collate(
             samples,
             drawing,
@@ -148,7 +164,7 @@ def make_collate(
             beta=importance_exponent_at(config.replay, learner.learner_step),
         )
 
-    return collate_now
+    return beside_the_step(collated, learner.device)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,9 @@ Shapes: B = transitions, W = records a transition may touch, R = bytes of a reco
 stacked in a state, V = width of a picture in px.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from common.config import ReplayConfig
 from common.errors import WireError
 from common.schedule import value_at
 from common.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples
-from services.learner.drawing import Drawing, Turns
+from services.learner.drawing import Drawing, Turns, to_device
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,19 @@ class Batch:
     next_observation: torch.Tensor  # uint8 [B, S, V, V], k steps later
     importance_weights: torch.Tensor  # float32 [B], largest is 1
     keys: Int64Array  # [B], of the transitions in replay
+
+    @property
+    def tensors(self) -> tuple[torch.Tensor, ...]:
+        """All but the keys."""
+        return tuple(getattr(self, name) for name in _TENSORS)
+
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Self:
+        """The batch with each of its tensors changed, and the same keys."""
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _TENSORS}
+        return replace(self, **changed)
+
+
+_TENSORS = tuple(field.name for field in fields(Batch) if field.name != "keys")
 
 
 def importance_exponent_at(replay: ReplayConfig, learner_step: int) -> float:
@@ -71,16 +85,16 @@ def collate(
         actions[rows] = symmetry.apply_to_actions(actions[rows])
     pictures = draw(samples.records, turns)
     device = pictures.device
-    offsets = torch.from_numpy(samples.bootstrap_offsets.astype(np.int64)).to(device)
+    offsets = to_device(samples.bootstrap_offsets.astype(np.int64), device)
     each = torch.arange(len(samples), device=device)[:, None]
     window = offsets[:, None] + torch.arange(stack, device=device)
     return Batch(
         observation=pictures[:, :stack],
-        action=torch.from_numpy(actions.astype(np.int64)).to(device),
-        reward=torch.from_numpy(samples.rewards.astype(np.float32)).to(device),
-        discount=torch.from_numpy(samples.discounts.astype(np.float32)).to(device),
+        action=to_device(actions.astype(np.int64), device),
+        reward=to_device(samples.rewards.astype(np.float32), device),
+        discount=to_device(samples.discounts.astype(np.float32), device),
         next_observation=pictures[each, window],
-        importance_weights=torch.from_numpy(importance_weights(samples, beta)).to(device),
+        importance_weights=to_device(importance_weights(samples, beta), device),
         keys=samples.keys.copy(),  # the samples are valid for a while only
     )
 

@@ -12,10 +12,11 @@ picture that holds a shape.
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from common.arena import ObservationCodec, Symmetry, make_codec
@@ -61,7 +62,7 @@ class HostDrawing:
         pictures = np.require(self._decode(records), requirements=["C", "W"])
         for symmetry, rows in turns:
             pictures[rows] = symmetry.apply_to_pictures(pictures[rows])
-        return torch.from_numpy(pictures).to(self._device)
+        return to_device(pictures, self._device)
 
 
 class ThreadedDecode:
@@ -103,10 +104,10 @@ class DeviceDrawing:
                 f"[..., {self._record_bytes}]"
             )
         numbers = np.array(records, order="C").reshape(-1, records.shape[-1]).view("<f4")
-        flat = self._views.draw(torch.from_numpy(numbers).to(self._device))
+        flat = self._views.draw(to_device(numbers, self._device))
         pictures = flat.reshape(*records.shape[:-1], *flat.shape[1:])
         for symmetry, rows in turns:
-            at = torch.from_numpy(rows).to(self._device)
+            at = to_device(rows, self._device)
             pictures[at] = turned(pictures[at], symmetry)
         return pictures
 
@@ -126,6 +127,14 @@ def make_drawing(
     if threads is None:
         return HostDrawing(codec.decode, device)
     return HostDrawing(ThreadedDecode(codec, config.view_px, threads), device)
+
+
+def to_device(array: NDArray[Any], device: torch.device) -> Tensor:
+    """The array as a tensor there, sharing its memory on the CPU; no copy waits for the device."""
+    tensor = torch.from_numpy(array)
+    if device.type != "cuda":
+        return tensor.to(device)
+    return tensor.pin_memory().to(device, non_blocking=True)
 
 
 def turned(pictures: Tensor, symmetry: Symmetry) -> Tensor:

@@ -2,11 +2,13 @@
 
 Invariants: no clock, lock or transport; the target network is a copy of the online one taken at
 the last multiple of target_period; a learner restored from `state()` goes on exactly as the one
-that gave it; nothing in `step` waits for the device.
+that gave it; a step is the same operations in the same order whether it is done as they come or
+replayed, and nothing in it waits for the device.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,23 +24,17 @@ from common.network import (
     load_weights,
     precision,
     read_arrays,
+    resolve_device,
     weights_to_bytes,
 )
 from common.schedule import value_at
 from services.learner.batch import Batch
+from services.learner.launch import CudaGraphs, Recorder, Recording
+from services.learner.slices import Slices
 from services.learner.targets import double_dqn_target, dqn_target, td_loss
+from services.learner.update import Update
 
 RMSPROP_DECAY = 0.9  # of the ancestor's library
-
-
-@dataclass(frozen=True, slots=True)
-class Update:
-    """What one step tells; tensors stay on the device until someone reads them."""
-
-    loss: Tensor  # float32 []
-    td_errors: Tensor  # float32 [B], target - Q(s, a), rewards scaled
-    mean_q: Tensor  # float32 [], mean over the batch of max_a Q(s, a)
-    gradient_norm: Tensor  # float32 [], before clipping
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,30 +48,43 @@ class LearnerState:
     rng_state: dict[str, Any]  # of the symmetries' generator, as JSON takes it
 
 
-def resolve_device(setting: str) -> torch.device:
-    """`auto`: cuda if there is one, else cpu. Raises ConfigError for a device that is none."""
-    if setting == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(setting)
-    except RuntimeError as error:
-        raise ConfigError(f"learner.device {setting!r} is no device; use auto or cpu") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"learner.device {setting!r}: no CUDA device here; use auto or cpu")
-    return device
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What some rows of a batch bring."""
+
+    loss: Tensor  # float32 [], their share in the batch's
+    greedy_q: Tensor  # float32 [rows]
+    td_errors: Tensor  # float32 [rows]
+    gradients: tuple[Tensor, ...]  # of the loss, by operand
 
 
 class Learner:
     """Online and target network, optimiser and their step."""
 
     def __init__(
-        self, agent: AgentConfig, learner: LearnerConfig, *, stack: int, view_px: int
+        self,
+        agent: AgentConfig,
+        learner: LearnerConfig,
+        *,
+        stack: int,
+        view_px: int,
+        threads: int = 1,
+        recorder: Recorder | None = None,
     ) -> None:
+        """threads: that share a batch on a CPU, each one of torch's. recorder: of steps, instead
+        of the device's own.
+
+        Raises ConfigError for a device that is none, or one that cannot do what learner.step says.
+        """
         self.agent = agent
-        self.device = resolve_device(learner.device)
+        self.device = resolve_device(learner.device, "learner.device")
         self.learner_step = 0
         self.rng = np.random.default_rng(learner.seed)  # for whoever draws symmetries
         self._sent_as = SENT_AS[learner.publish_precision]
+        self._slices = Slices(threads if self.device.type == "cpu" else 1)
+        self._recorder = recorder or _device_recorder(learner.step, self.device)
+        self.updates_per_launch = learner.updates_per_launch if self._recorder else 1
+        self._recordings: dict[int, Recording] = {}
         dtype = precision(learner.precision, self.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(learner.seed)
@@ -83,33 +92,79 @@ class Learner:
             target = QNetwork(agent.kind, stack=stack, view_px=view_px, compute_dtype=dtype)
         self.online = online.to(self.device)
         self.target = target.to(self.device).requires_grad_(requires_grad=False)
+        self._target_operands = self.target.operands()
         self._copy_to_target()
+        self._learning_rate = torch.zeros((), device=self.device)  # where a recorded step reads it
         self._optimizer = self._make_optimizer()
 
     def __repr__(self) -> str:
+        step = "eager" if self._recorder is None else f"graph of up to {self.updates_per_launch}"
         return (
-            f"Learner(kind={self.agent.kind!r}, device={str(self.device)!r}, "
+            f"Learner(kind={self.agent.kind!r}, device={str(self.device)!r}, step={step!r}, "
             f"dtype={self.online.compute_dtype}, learner_step={self.learner_step})"
         )
 
     def step(self, batch: Batch) -> Update:
         """Learn from one batch; the td_errors are of the parameters before the step."""
-        operands = self.online.operands()
-        target = self._target(batch, operands)
-        q = self.online.evaluate(self.online.prepare(batch.observation), operands)
-        loss, td_errors = td_loss(
-            q, batch.action, target, batch.importance_weights, self.agent.loss
+        return self.steps([batch])[0]
+
+    def steps(self, batches: Sequence[Batch]) -> list[Update]:
+        """Learn from these batches of one size, one after the other; `updates_per_launch` of them
+        in one launch where no copy to the target network lies between.
+        """
+        updates: list[Update] = []
+        while len(updates) < len(batches):
+            following = batches[len(updates) :][: self.updates_per_launch]
+            period = self.agent.target_period
+            if not self.updates_per_launch == len(following) <= period - self.learner_step % period:
+                following = following[:1]
+            updates += self._launch(following)
+            self.learner_step += len(following)
+            if self.learner_step % period == 0:
+                self._copy_to_target()
+        return updates
+
+    def _launch(self, batches: Sequence[Batch]) -> list[Update]:
+        rates = [self._rate_at(self.learner_step + i) for i in range(len(batches))]
+        if self._recorder is None:
+            self._learning_rate.fill_(rates[0])
+            return [self._update(batches[0])]
+        num = len(batches)
+        if num not in self._recordings:
+            self._recordings[num] = Recording(
+                self._recorder, self._update, self._learning_rate, batches[0], num
+            )
+        return self._recordings[num](batches, rates)
+
+    def _update(self, batch: Batch) -> Update:
+        """One step on the device; nothing of it waits for the device or counts in Python."""
+        with torch.no_grad():
+            operands = self.online.operands()
+            reward = batch.reward * self.agent.reward_scale
+        size = len(batch.keys)
+        scaled = replace(batch, reward=reward)
+        parts = self._slices.map(
+            lambda rows: self._differentiate(scaled.map(lambda x: x[rows]), operands, size), size
         )
-        self._set_learning_rate()
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        self.online.set_gradients([part.gradients for part in parts])
         gradient_norm = self._clip_gradient()
         self._optimizer.step()
-        self.learner_step += 1
-        if self.learner_step % self.agent.target_period == 0:
-            self._copy_to_target()
-        mean_q = q.detach().max(dim=1).values.mean()
-        return Update(loss.detach(), td_errors, mean_q, gradient_norm)
+        return Update(
+            loss=torch.stack([part.loss for part in parts]).sum(),
+            mean_q=torch.cat([part.greedy_q for part in parts]).mean(),
+            gradient_norm=gradient_norm,
+            td_errors=torch.cat([part.td_errors for part in parts]),
+        )
+
+    def _differentiate(self, rows: Batch, operands: Operands, size: int) -> _Part:
+        """Loss of these rows of a batch of that size, and its gradient."""
+        leaves = {name: x.detach().requires_grad_() for name, x in operands.items()}
+        target = self._target(rows, operands)
+        q = self.online.evaluate(self.online.prepare(rows.observation), leaves)
+        mean, td_errors = td_loss(q, rows.action, target, rows.importance_weights, self.agent.loss)
+        loss = mean * (len(q) / size)
+        gradients = torch.autograd.grad(loss, list(leaves.values()))
+        return _Part(loss.detach(), q.detach().max(dim=1).values, td_errors, gradients)
 
     def payload(self) -> bytes:
         """The online parameters for publication; raises DivergedError if one is not finite."""
@@ -155,7 +210,8 @@ class Learner:
             raise CheckpointError(f"the checkpoint's rng_state is damaged: {error}") from error
         load_weights(self.target, state.target)
         load_weights(self.online, state.model)
-        self._target_operands = self.target.operands()
+        self._refresh_target_operands()
+        self._recordings.clear()
         self._optimizer = self._make_optimizer()
         for name, parameter in self.online.named_parameters():
             if moments:
@@ -178,40 +234,37 @@ class Learner:
                 f"the checkpoint's optimiser is not {self.agent.optimizer} of a "
                 f"{self.agent.kind} network like this"
             )
-        host = torch.device("cpu")  # where RMSprop, which is not fused, counts its steps
-        return {
-            name: array.to(
-                host if name.endswith(":step") and not self._adam else self.device, copy=True
-            )
-            for name, array in arrays.items()
-        }
+        return {name: array.to(self.device, copy=True) for name, array in arrays.items()}
 
     @property
     def _moments(self) -> tuple[str, ...]:
         return ("step", "exp_avg", "exp_avg_sq") if self._adam else ("step", "square_avg")
 
-    def _set_learning_rate(self) -> None:
-        factor = value_at(self.agent.learning_rate_schedule, self.learner_step)
-        self._optimizer.param_groups[0]["lr"] = self.agent.learning_rate * factor
+    def _rate_at(self, learner_step: int) -> float:
+        return self.agent.learning_rate * value_at(self.agent.learning_rate_schedule, learner_step)
 
     @property
     def _adam(self) -> bool:
         return self.agent.optimizer == "adam"
 
-    def _target(self, batch: Batch, operands: Operands) -> Tensor:
+    def _target(self, rows: Batch, operands: Operands) -> Tensor:
         """y of Eq. (2), or of Eq. (4) for `dqn`, float32 [B]; operands: of the online network."""
-        reward = batch.reward * self.agent.reward_scale
         with torch.no_grad():
-            next_states = self.target.prepare(batch.next_observation)
+            next_states = self.target.prepare(rows.next_observation)
             target_next_q = self.target.evaluate(next_states, self._target_operands)
             if self.agent.kind == "dqn":
-                return dqn_target(reward, batch.discount, target_next_q)
+                return dqn_target(rows.reward, rows.discount, target_next_q)
             online_next_q = self.online.evaluate(next_states, operands)
-            return double_dqn_target(reward, batch.discount, online_next_q, target_next_q)
+            return double_dqn_target(rows.reward, rows.discount, online_next_q, target_next_q)
 
     def _copy_to_target(self) -> None:
         self.target.load_state_dict(self.online.state_dict())
-        self._target_operands = self.target.operands()
+        self._refresh_target_operands()
+
+    def _refresh_target_operands(self) -> None:
+        """In place: a recorded step reads them where they are."""
+        operands = self.target.operands()
+        torch._foreach_copy_(list(self._target_operands.values()), list(operands.values()))
 
     def _clip_gradient(self) -> Tensor:
         limit = self.agent.max_gradient_norm
@@ -221,8 +274,25 @@ class Learner:
         return torch.nn.utils.get_total_norm(p.grad for p in parameters if p.grad is not None)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
-        parameters = list(self.online.parameters())
-        rate, epsilon = self.agent.learning_rate, self.agent.optimizer_epsilon
+        parameters, capturable = list(self.online.parameters()), self.device.type == "cuda"
+        rate, epsilon = self._learning_rate, self.agent.optimizer_epsilon
         if self._adam:
-            return torch.optim.Adam(parameters, lr=rate, eps=epsilon, fused=True)
-        return torch.optim.RMSprop(parameters, lr=rate, eps=epsilon, alpha=RMSPROP_DECAY)
+            return torch.optim.Adam(
+                parameters, lr=rate, eps=epsilon, fused=True, capturable=capturable
+            )
+        return torch.optim.RMSprop(
+            parameters, lr=rate, eps=epsilon, alpha=RMSPROP_DECAY, capturable=capturable
+        )
+
+
+def _device_recorder(
+    setting: Literal["auto", "eager", "graph"], device: torch.device
+) -> Recorder | None:
+    """Of CUDA graphs where the device and the setting have them; None: steps are eager."""
+    if device.type == "cuda":
+        return None if setting == "eager" else CudaGraphs()
+    if setting == "graph":
+        raise ConfigError(
+            f"learner.step 'graph': only a CUDA device replays graphs, not {device}; use auto"
+        )
+    return None

@@ -6,9 +6,10 @@ from typing import TypeVar
 
 from services.learner.batch import Batch
 from services.learner.keeper import Keeper
-from services.learner.learner import Learner, Update
+from services.learner.learner import Learner
 from services.learner.prefetch import Prefetcher
 from services.learner.priorities import PrioritiesSender
+from services.learner.update import Update
 from services.learner.vitals import Vitals
 
 T = TypeVar("T")
@@ -55,10 +56,5 @@ class Meter:
         }
         metrics |= {f"{stage}_share": s / lived_s for stage, s in self._seconds.items()}
         if self.last is not None:
-            batch, update = self.last
-            metrics["loss"] = float(update.loss)
-            metrics["mean_q"] = float(update.mean_q)
-            metrics["td_error_mean"] = float(update.td_errors.abs().mean())
-            metrics["gradient_norm"] = float(update.gradient_norm)
-            metrics |= self._vitals.look(batch, update)
+            metrics |= self._vitals.look(*self.last)
         return metrics

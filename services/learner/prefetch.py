@@ -49,17 +49,20 @@ class Prefetcher:
         """When replay last answered, on the monotonic clock."""
         return self._reader.heard_s
 
-    def next(self, timeout_s: float) -> Batch | None:
-        """The next batch; None where none is ready within the time.
+    def next(self, timeout_s: float, most: int = 1) -> list[Batch]:
+        """The next batches, `most` or as many as are ready; none where none is within the time.
 
         Raises the error that ended the fetching.
         """
         try:
-            return self._ready.get(timeout=timeout_s)
+            batches = [self._ready.get(timeout=timeout_s)]
         except queue.Empty:
             if self._error is not None:
                 raise self._error from None
-            return None
+            return []
+        while len(batches) < most and not self._ready.empty():  # nobody else takes any
+            batches.append(self._ready.get_nowait())
+        return batches
 
     def close(self) -> None:
         """End the thread; the stop signal must be set."""

@@ -1,23 +1,33 @@
 """Signs that learning goes astray, told while it can still be mended.
 
-Invariants: looks only, and changes nothing; one inference on a few states for each look, so that
-a look a second costs next to nothing; a warning is logged once until its cause has gone.
+Invariants: looks only, and changes nothing; one inference on a few states and one transfer from
+the device for each look, so that a look a second costs next to nothing; a warning is logged once
+until its cause has gone; histograms have the same bins for as long as the run lasts.
 """
 
 import logging
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from common.config import Config
+from common.trajectory import Float32Array
 from services.learner.batch import Batch
-from services.learner.learner import Learner, Update
+from services.learner.learner import Learner
+from services.learner.update import Update
 
 _LOG = logging.getLogger("learner")
 _STATES = 64  # of a batch that are looked at
 _TOO_LARGE = 2.0  # times the largest return
 _TOO_DEAD = 0.9
+
+# Between the bins of a histogram, in largest returns
+_Q_EDGES = np.linspace(-1.0, 1.0, 9)
+_TD_ERROR_EDGES = 10.0 ** np.linspace(-4.0, 0.0, 9)
+_LOOKS_A_HISTOGRAM = 15
 
 
 class Vitals:
@@ -27,13 +37,25 @@ class Vitals:
         self._learner = learner
         self._largest_return = largest_return(config)
         self._warned: set[str] = set()
+        self._looks = 0
+        self._histograms = {
+            "q": Histogram(_Q_EDGES * self._largest_return),
+            "td_error": Histogram(_TD_ERROR_EDGES * self._largest_return),
+        }
 
     def look(self, batch: Batch, update: Update) -> dict[str, float]:
-        """Metrics by name after a step on this batch; logs what is alarming."""
-        q, dead_share = self._infer(batch.observation[:_STATES])
-        errors = update.td_errors.abs()
-        q_min, q_p50, q_max = _quantiles(q, 0.0, 0.5, 1.0)
-        error_p50, error_p90, error_p99 = _quantiles(errors, 0.5, 0.9, 0.99)
+        """Metrics by name after a step on this batch; logs what is alarming.
+
+        Histograms are of the looks since the last ones, with the first and then each 15th.
+        """
+        values, dead = self._infer(batch.observation[:_STATES])
+        network = torch.stack([dead, self._drift()])
+        found = torch.cat([network, values.flatten(), update.numbers()]).cpu().numpy()
+        (dead_share, target_drift), q, told = np.split(found, [2, 2 + values.numel()])
+        (loss, mean_q, gradient_norm), errors = told[:3], np.abs(told[3:])
+        with np.errstate(invalid="ignore"):  # where there are infinite ones
+            q_min, q_p50, q_max = np.quantile(q, (0.0, 0.5, 1.0))
+            error_p50, error_p90, error_p99 = np.quantile(errors, (0.5, 0.9, 0.99))
         self._warn(
             "values",
             max(-q_min, q_max) > _TOO_LARGE * self._largest_return,
@@ -47,7 +69,11 @@ class Vitals:
             "learned any more; lower agent.learning_rate and start anew",
         )
         return {
-            "loss_finite": math.isfinite(float(update.loss)),
+            "loss": loss,
+            "mean_q": mean_q,
+            "td_error_mean": errors.mean(),
+            "gradient_norm": gradient_norm,
+            "loss_finite": math.isfinite(loss),
             "q_min": q_min,
             "q_p50": q_p50,
             "q_max": q_max,
@@ -55,10 +81,11 @@ class Vitals:
             "td_error_p90": error_p90,
             "td_error_p99": error_p99,
             "dead_share": dead_share,
-            "target_drift": self._target_drift(),
+            "target_drift": target_drift,
+            **self._binned(q=q, td_error=errors),
         }
 
-    def _infer(self, states: Tensor) -> tuple[Tensor, float]:
+    def _infer(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Values [B, A], and the share of hidden units that are 0 for all these states.
 
         Of a convolution the units are its channels.
@@ -68,21 +95,53 @@ class Vitals:
         with torch.no_grad():
             q = network.evaluate(network.prepare(states), network.operands(), seen)
         dead = torch.cat([x.transpose(0, 1).flatten(1).amax(1) <= 0 for x in seen])
-        return q, float(dead.float().mean())
+        return q, dead.float().mean()
 
-    def _target_drift(self) -> float:
+    def _drift(self) -> Tensor:
         """Distance of the online parameters from the target's, relative to the latter's length."""
         online, target = self._learner.online.parameters(), self._learner.target.parameters()
         with torch.no_grad():
             pairs = [(p - t, t) for p, t in zip(online, target, strict=True)]
             far = torch.nn.utils.get_total_norm([difference for difference, _ in pairs])
             length = torch.nn.utils.get_total_norm([parameter for _, parameter in pairs])
-        return float(far / length)
+        return far / length
+
+    def _binned(self, **values: Float32Array) -> dict[str, float]:
+        """The histograms, where it is time for them."""
+        for name, histogram in self._histograms.items():
+            histogram.add(values[name])
+        self._looks += 1
+        if self._looks % _LOOKS_A_HISTOGRAM != 1:
+            return {}
+        return {
+            f"{name}_bin_{i}": share
+            for name, histogram in self._histograms.items()
+            for i, share in enumerate(histogram.take())
+        }
 
     def _warn(self, cause: str, alarming: bool, text: str) -> None:
         if alarming and cause not in self._warned:
             _LOG.warning("%s", text)
         (self._warned.add if alarming else self._warned.discard)(cause)
+
+
+class Histogram:
+    """Counts of values by bin: below the first edge, between edges, from the last one on."""
+
+    def __init__(self, edges: NDArray[np.float64]) -> None:
+        self._edges = edges
+        self._counts = np.zeros(len(edges) + 1)
+
+    def add(self, values: Float32Array) -> None:
+        """Values that are not numbers are left out."""
+        bins = np.searchsorted(self._edges, values[~np.isnan(values)], side="right")
+        self._counts += np.bincount(bins, minlength=len(self._counts))
+
+    def take(self) -> list[float]:
+        """The share of each bin in all since the last time; zeros where there were no values."""
+        shares = self._counts / max(self._counts.sum(), 1.0)
+        self._counts[:] = 0
+        return [float(share) for share in shares]
 
 
 def largest_return(config: Config) -> float:
@@ -95,8 +154,3 @@ def largest_return(config: Config) -> float:
         + steps * abs(arena.step_reward)
     )
     return config.agent.reward_scale * rewards
-
-
-def _quantiles(values: Tensor, *shares: float) -> list[float]:
-    found = torch.quantile(values.flatten().float(), torch.tensor(shares, device=values.device))
-    return [float(value) for value in found]

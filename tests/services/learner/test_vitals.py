@@ -60,6 +60,28 @@ def test_the_figures_are_those_of_the_batch_and_the_network() -> None:
     assert 0.0 < found["target_drift"] < 0.1
 
 
+def test_histograms_are_of_the_looks_since_the_last_ones() -> None:
+    """Errors of a tenth of the largest return fall into one known bin, far values outside."""
+    config = config_of()
+    learner, batch = learner_of(config), random_batch()
+    vitals, update = Vitals(config, learner), learner.step(batch)
+    bound = largest_return(config)
+    errors = torch.tensor([0.0, 0.2, -0.2, 2.0, -2.0, 2.0, math.nan, 2.0]) * bound
+    told = dataclasses.replace(update, td_errors=errors)
+    first = vitals.look(batch, told)
+    assert [first[f"td_error_bin_{i}"] for i in range(10)] == pytest.approx(
+        [1 / 7, *[0.0] * 6, 2 / 7, 0.0, 4 / 7]
+    )
+    assert [first[f"q_bin_{i}"] for i in (4, 5)] != [0.0, 0.0]
+    with torch.no_grad():
+        learner.online.value.bias.fill_(-1.5 * bound)
+    between = [vitals.look(batch, update) for _ in range(14)]
+    assert not any("bin" in name for found in between for name in found)
+    then = vitals.look(batch, update)
+    assert [then[f"q_bin_{i}"] for i in range(10)] == [1.0, *[0.0] * 9]
+    assert sum(then[f"td_error_bin_{i}"] for i in range(10)) == pytest.approx(1.0)
+
+
 def test_dead_units_are_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
     config = config_of()
     learner, batch = learner_of(config), random_batch()
@@ -111,8 +133,8 @@ class Prefetched:
     def __init__(self, batches: list[Batch]) -> None:
         self._batches = batches
 
-    def next(self, _timeout_s: float) -> Batch:
-        return self._batches.pop(0)
+    def next(self, _timeout_s: float, _most: int) -> list[Batch]:
+        return [self._batches.pop(0)]
 
 
 def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_path: Path) -> None:
