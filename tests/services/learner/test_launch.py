@@ -7,17 +7,24 @@ that stay where they are: all but the recording itself is what runs on a GPU.
 import dataclasses
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Literal
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
 
-from common.config import AgentConfig, LearnerConfig
+from common.config import AgentConfig, LearnerConfig, load_config
 from common.errors import ConfigError, DivergedError
+from common.process import StopSignal
+from common.trajectory import Weights
+from services.learner.__main__ import run
 from services.learner.batch import Batch
+from services.learner.keeper import Keeper
 from services.learner.launch import Recorder, Work
 from services.learner.learner import Learner
+from services.learner.prefetch import Prefetcher
 from services.learner.update import Update
 from tests.services.learner.test_learner import FLOAT32, VIEW_PX, random_batch
 
@@ -133,6 +140,50 @@ def test_several_updates_are_one_launch_unless_the_target_is_copied_between() ->
     assert launches == [1, 2, 5, 6]  # 8 lies within the third
     learner.steps(batches()[:2])
     assert replay.launches == 8
+
+
+class Ready:
+    """Batches that a prefetcher has ready, as many as are asked for."""
+
+    ready = refused = 0
+    decode_s = heard_s = 0.0
+
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+
+    def next(self, _timeout_s: float, most: int) -> list[Batch]:
+        self.asked.append(most)
+        return batches(most)
+
+
+def test_no_launch_passes_over_a_publication_or_the_end(tmp_path: Path) -> None:
+    settings = {
+        "arena.view_px": str(VIEW_PX),
+        "learner.device": "cpu",
+        "learner.precision": "float32",
+        "learner.updates_per_launch": "3",
+        "learner.publish_period": "4",
+        "run.learner_steps": "9",
+    }
+    config = load_config(None, settings, environ={})
+    learner = make_learner(config.agent, Replay(), config.learner)
+    published: list[Weights] = []
+    writer, ready, priorities = MagicMock(), Ready(), MagicMock(dropped=0)
+    writer.publish.side_effect = published.append
+    keeper = Keeper(config, learner, tmp_path)
+    run(config, learner, ready, priorities, writer, keeper, MagicMock(), StopSignal())  # type: ignore[arg-type]
+    assert [weights.learner_step for weights in published] == [0, 4, 8, 9]
+    assert ready.asked == [3, 1, 3, 1, 1]
+    assert priorities.put.call_count == 9
+
+
+def test_batches_that_wait_are_given_together() -> None:
+    stop, samples = StopSignal(), iter(range(5))
+    reader = MagicMock()
+    reader.sample.side_effect = lambda: next(samples, None)
+    prefetcher = Prefetcher(reader, lambda sampled: sampled, depth=5, stop=stop)  # type: ignore[arg-type, return-value]
+    prefetcher.close()  # once all five wait
+    assert [prefetcher.next(0.0, most) for most in (2, 1, 4, 4)] == [[0, 1], [2], [3, 4], []]
 
 
 def test_what_an_update_told_stays_after_the_next() -> None:
