@@ -1,0 +1,312 @@
+"""kill -9 of a run's learner at random moments: versions never go back, and learning goes on.
+
+`python -m benchmarks.learner_kills --kills 20` runs replay, an actor, an evaluator and robots that
+act by a `LivePolicy`, kills the learner again and again, each fifth time while it still starts, and
+starts it again. What is acted by is compared with what was published, to the last bit; afterwards
+the last weights before each kill and the first ones after it are judged on the same starts. Prints
+one line of JSON; exit code 1 where anything went back or was mixed.
+"""
+
+import argparse
+import hashlib
+import math
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import emit
+from common.config import TransportConfig
+from common.keys import Keys
+from common.live import LivePolicy
+from common.network import weights_to_bytes
+from common.trajectory import Evaluation, Stats, Weights
+from common.transport import Session, free_endpoint
+from common.weights import WeightsReader
+from common.wire import decode
+from services.evaluator.__main__ import Judge
+from services.train.fleet import ALLOCATOR
+from tests.system.system_processes import Command, end_all, eventually, run_name
+
+# One robot with small pictures: learned within the minutes that the kills take.
+SETTINGS = (
+    "--arena.num_robots=1",
+    "--arena.view_px=40",
+    "--arena.max_frames=300",
+    "--exploration.schedule=[[0, 1.0], [4000, 0.1]]",
+    "--replay.min_size=2000",
+    "--learner.publish_period=25",
+    "--learner.checkpoint_period_s=5",
+    "--evaluator.period_s=5",
+)
+DURING_START = 5  # each so many-th kill is followed by one while the learner starts
+_ROBOTS = 2  # that act by a LivePolicy, each with a session of its own
+
+Order = tuple[int, int]  # (epoch, version)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=300, help="of the learner between kills")
+    parser.add_argument("--longest", type=float, default=5.0, help="seconds more, at random")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = ordeal(
+            Path(folder),
+            ["--config", "quick", *SETTINGS],
+            kills=arguments.kills,
+            seed=arguments.seed,
+            steps=arguments.steps,
+            longest_s=arguments.longest,
+        )
+    emit({"bench": "learner_kills", **found})
+    return 1 if found["went_back"] or found["mixed"] else 0
+
+
+def ordeal(
+    folder: Path, configured: Sequence[str], *, kills: int, seed: int, steps: int, longest_s: float
+) -> dict[str, Any]:
+    """What came of so many kills.
+
+    configured: flags of replay, with the configuration. steps: that the learner makes at least
+    between two kills. longest_s: and so many seconds more, at random.
+    """
+    rng = random.Random(seed)
+    name, endpoint, began_s = run_name("kills"), free_endpoint(), time.monotonic()
+    here = ["--run", name, "--run-dir", folder]
+    joining = [*here, "--connect", endpoint, "--id"]
+
+    def process(role: str) -> Command:
+        return Command([role, *joining, f"{role}-0"], folder, **ALLOCATOR)
+
+    last_words = ""
+    resumed: list[tuple[Weights, Weights]] = []
+    try:
+        with (
+            Command(["replay", *here, "--listen", endpoint, *configured], folder),
+            Session(TransportConfig(connect=(endpoint,)), open_timeout_s=120) as session,
+            ExitStack() as running,
+        ):
+            running.enter_context(process("actor"))
+            running.enter_context(process("evaluator"))
+            follower, robots = Follower(session, Keys(name)), list[Robot]()
+            for number in range(kills + 1):
+                before, due = follower.newest, follower.learner_step + steps
+                with process("learner") as learner:
+                    eventually(lambda: follower.is_newer_than(before), "weights after the kill")  # noqa: B023
+                    if before is not None:
+                        resumed.append((before, follower.first_after(before)))
+                    if not robots:
+                        robots += [
+                            running.enter_context(acting(name, endpoint)) for _ in range(_ROBOTS)
+                        ]
+                    due = max(due, follower.learner_step + steps)
+                    eventually(lambda: follower.reaches(due), f"learner step {due}")  # noqa: B023
+                    if number == kills:
+                        newest = follower.taken[-1].version
+                        eventually(lambda: follower.has_judged(newest), f"{newest} is judged")  # noqa: B023
+                        learner.signal(signal.SIGTERM)
+                        code = learner.wait()
+                        last_words = learner.err
+                        break
+                    follower.listen_for(rng.uniform(0.0, longest_s))
+                    kill(learner)
+                if number % DURING_START == DURING_START - 1:
+                    with process("learner") as starting:
+                        follower.listen_for(rng.uniform(0.5, 4.0))
+                        kill(starting)
+                follower.listen_for(1.0)  # what was under way
+            follower.listen_for(1.0)
+            config = robots[0].config
+            seconds = time.monotonic() - began_s
+    finally:
+        end_all(name)
+    judge = Judge(config, "judge")
+    return {
+        "kills": kills + kills // DURING_START,
+        "seed": seed,
+        "seconds": round(seconds, 1),
+        "ended": (code, "going on from" in last_words),
+        "learner_steps": follower.learner_step,
+        "published": len(follower.published),
+        "epochs": len({weights.epoch for weights in follower.published}),
+        "went_back": follower.went_back() + [line for r in robots for line in r.went_back()],
+        "mixed": [line for robot in robots for line in robot.mixed(follower.digests())],
+        "acted_by": [len(robot.acted) for robot in robots],
+        "evaluations": [
+            (e.learner_step, e.weights_version, e.success_rate) for e in follower.judged
+        ],
+        **scores([(judge.judge(a, _on), judge.judge(b, _on)) for a, b in resumed]),
+    }
+
+
+def _on() -> bool:
+    return True
+
+
+def kill(learner: Command) -> None:
+    learner.signal(signal.SIGKILL)
+    if learner.wait() != -signal.SIGKILL:
+        raise AssertionError(f"the learner ended by itself: {learner.err}")
+
+
+def scores(judged: Sequence[tuple[Evaluation | None, Evaluation | None]]) -> dict[str, Any]:
+    """Successes before a kill and after it, and what they differ by in standard deviations.
+
+    Each pair was judged on the same starts; `beyond_noise` counts those that differ by more than
+    two proportions of that many episodes do in 95 of 100 cases.
+    """
+    pairs = [(a, b) for a, b in judged if a is not None and b is not None]
+    deviations = []
+    for before, after in pairs:
+        rate = (before.success_rate + after.success_rate) / 2
+        error = math.sqrt(2 * rate * (1 - rate) / before.episodes)
+        difference = after.success_rate - before.success_rate
+        deviations.append(difference / error if error else 0.0)
+    differences = [b.success_rate - a.success_rate for a, b in pairs]
+    return {
+        "resumed": [
+            (a.learner_step, b.learner_step, a.success_rate, b.success_rate) for a, b in pairs
+        ],
+        "mean_difference": round(float(np.mean(differences)), 4) if differences else 0.0,
+        "beyond_noise": sum(abs(d) > 1.96 for d in deviations),
+    }
+
+
+class Follower:
+    """Hears all that is published of weights, evaluations and statistics, and follows itself."""
+
+    def __init__(self, session: Session, keys: Keys) -> None:
+        self._reader = WeightsReader(session, keys)
+        self._published = session.queue_subscriber(keys.weights)
+        self._evaluations = session.queue_subscriber(keys.every_evaluation)
+        self._stats = session.queue_subscriber(keys.every_stats)
+        self.taken: list[Weights] = []
+        self.published: list[Weights] = []
+        self.judged: list[Evaluation] = []
+        self.told: dict[str, list[int]] = {"actor": [], "evaluator": [], "learner": []}
+
+    @property
+    def newest(self) -> Weights | None:
+        return self.published[-1] if self.published else None
+
+    @property
+    def learner_step(self) -> int:
+        return self.published[-1].learner_step if self.published else 0
+
+    def listen(self) -> None:
+        """For half a second at most, or until the reader has newer weights."""
+        newer = self._reader.latest(0.5)
+        self.taken += [newer] if newer else []
+        self.published += [decode(Weights, payload) for _, payload in self._published.drain()]
+        self.judged += [decode(Evaluation, payload) for _, payload in self._evaluations.drain()]
+        for _, payload in self._stats.drain():
+            stats = decode(Stats, payload)
+            if stats.role in self.told:
+                self.told[stats.role].append(int(stats.metrics["weights_version"]))
+
+    def listen_for(self, seconds: float) -> None:
+        until_s = time.monotonic() + seconds
+        while time.monotonic() < until_s:
+            self.listen()
+
+    def is_newer_than(self, before: Weights | None) -> bool:
+        self.listen()
+        return self.newest is not before and bool(self.taken)
+
+    def first_after(self, before: Weights) -> Weights:
+        """The weights published right after these."""
+        return self.published[self.published.index(before) + 1]
+
+    def reaches(self, learner_step: int) -> bool:
+        self.listen()
+        return bool(self.taken) and self.taken[-1].learner_step >= learner_step
+
+    def has_judged(self, version: int) -> bool:
+        self.listen()
+        return bool(self.judged) and self.judged[-1].weights_version >= version
+
+    def digests(self) -> dict[Order, str]:
+        return {weights.order: weights.digest for weights in self.published}
+
+    def went_back(self) -> list[str]:
+        """A line for each that came after a newer one: on the wire, taken, judged, acted by."""
+        lines = [
+            f"published {b.order} after {a.order}"
+            for a, b in pairwise(self.published)
+            if b.order <= a.order
+        ]
+        lines += [
+            f"taken {b.order} after {a.order}"
+            for a, b in pairwise(self.taken)
+            if b.order <= a.order
+        ]
+        judged = [(e.weights_epoch, e.weights_version) for e in self.judged]
+        lines += [f"judged {b} after {a}" for a, b in pairwise(judged) if b < a]
+        for role, versions in self.told.items():
+            lines += [f"{role} at {b} after {a}" for a, b in pairwise(versions) if b < a]
+        if self._reader.refused:
+            lines.append(f"{self._reader.refused} messages refused")
+        return lines
+
+
+class Robot:
+    """Acts by a LivePolicy in a thread of its own, and notes by which parameters."""
+
+    def __init__(self, run: str, endpoint: str) -> None:
+        self._policy = LivePolicy(run, endpoint, timeout_s=120)
+        self.config = self._policy.config
+        self.acted: list[tuple[Order, str]] = []
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._act)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+        self._policy.close()
+
+    def _act(self) -> None:
+        side = self.config.arena.view_px
+        policy = self._policy._policy
+        while not self._stopping.wait(0.02):
+            self._policy.act(np.zeros((1, side, side), np.uint8))
+            order = (policy.weights_epoch, policy.weights_version)
+            if not self.acted or self.acted[-1][0] != order:
+                payload = weights_to_bytes(policy.network)
+                self.acted.append((order, hashlib.sha256(payload).hexdigest()))
+
+    def went_back(self) -> list[str]:
+        return [f"acted by {b} after {a}" for (a, _), (b, _) in pairwise(self.acted) if b <= a]
+
+    def mixed(self, digests: dict[Order, str]) -> list[str]:
+        """A line for each version whose parameters, as acted by, are not those published."""
+        return [
+            f"acted by {order}, and not as it was published"
+            for order, digest in self.acted
+            if digests.get(order, digest) != digest
+        ]
+
+
+@contextmanager
+def acting(run: str, endpoint: str) -> Iterator[Robot]:
+    robot = Robot(run, endpoint)
+    try:
+        yield robot
+    finally:
+        robot.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
