@@ -50,7 +50,8 @@ def main() -> int:
     parser.add_argument("--join", nargs=2, metavar=("RUN", "ENDPOINT"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.join:
-        join(*arguments.join, arguments.joiners, arguments.seconds, arguments.seed)
+        run, endpoint = arguments.join
+        join(run, endpoint, arguments.joiners, arguments.seconds, arguments.seed)
         return 0
     with tempfile.TemporaryDirectory() as folder:
         found = joined(Path(folder), arguments)
@@ -61,7 +62,7 @@ def main() -> int:
 def joined(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     """What the joiners told, against what was published when."""
     name, endpoint = run_name("joiners"), free_endpoint()
-    here = ["--run", name, "--run-dir", folder]
+    here = ["--run", name, "--run-dir", str(folder)]
     joining = [*here, "--connect", endpoint, "--id"]
     serving = ["--config", arguments.config, "--listen", endpoint]
     each = arguments.joiners // arguments.processes

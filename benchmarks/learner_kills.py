@@ -47,6 +47,7 @@ SETTINGS = (
     "--learner.publish_period=25",
     "--learner.checkpoint_period_s=5",
     "--evaluator.period_s=5",
+    "--evaluator.episodes=50",
 )
 DURING_START = 5  # each so many-th kill is followed by one while the learner starts
 _ROBOTS = 2  # that act by a LivePolicy, each with a session of its own
@@ -84,7 +85,7 @@ def ordeal(
     """
     rng = random.Random(seed)
     name, endpoint, began_s = run_name("kills"), free_endpoint(), time.monotonic()
-    here = ["--run", name, "--run-dir", folder]
+    here = ["--run", name, "--run-dir", str(folder)]
     joining = [*here, "--connect", endpoint, "--id"]
 
     def process(role: str) -> Command:

@@ -387,6 +387,9 @@ class RunConfig(Section):
     """Evaluator processes. (ours)"""
     seed: int = 0
     """Of the arenas. (ours)"""
+    turn_size: Annotated[int, Field(ge=0)] = 0
+    """Transitions that the one actor collects before the learner takes its turn; the same seeds
+    then give the same numbers, over restarts too. 0: both at once. (ours)"""
     minutes: Annotated[float, Field(ge=0)] = 0
     """Ends the run after so long; 0: never. (ours)"""
     learner_steps: Annotated[int, Field(ge=0)] = 0
@@ -444,7 +447,33 @@ class Config(Section):
                 f"replay.min_size {self.replay.min_size}{shares} is below learner.batch_size "
                 f"{smallest}: the first batch would repeat transitions"
             )
+        if self.run.turn_size:
+            self._check_turns()
         return self
+
+    def _check_turns(self) -> None:
+        """Raise ValueError where turns of that size could not be taken, or not be repeated."""
+        replay, turn_size = self.replay, self.run.turn_size
+        robots = self.actor.num_arenas * self.arena.num_robots
+        samples = turn_size * replay.samples_per_insert
+        steps = samples / self.learner.batch_size
+        reasons = {
+            "takes one actor (run.actors)": self.run.actors > 1,
+            "takes one replay.shards": replay.shards > 1,
+            'takes a log, and replay.fsync "off" keeps none': replay.fsync == "off",
+            'takes replay.sampler "uniform": priorities come when they come': replay.prioritized,
+            f"is no multiple of {robots}, the robots of one actor": turn_size % robots,
+            "x replay.samples_per_insert is no multiple of the learner's request, "
+            f"{self.learner.sample_size}": not samples or samples % self.learner.sample_size,
+            f"ends at learner steps that are multiples of {steps:g}, and run.learner_steps "
+            f"{self.run.learner_steps} is none": steps and self.run.learner_steps % steps,
+            f"does not fit in replay.capacity, with replay.min_size {replay.min_size}": (
+                turn_size + replay.min_size + robots > replay.capacity
+            ),
+        }
+        for reason, holds in reasons.items():
+            if holds:
+                raise ValueError(f"run.turn_size {turn_size} {reason}")
 
 
 def sections() -> dict[str, type[Section]]:

@@ -43,9 +43,10 @@ _LARGE_BYTES = 8192  # of an array that follows the map
 
 @dataclass(frozen=True, slots=True)
 class SampleRequest:
-    """A learner's wish for one mini-batch."""
+    """A learner's wish for mini-batches."""
 
     batch_size: int
+    learner_step: int = -1  # of a run that takes turns: drawn for the step after so many
 
 
 def _check_chunk(chunk: Chunk) -> str | None:
@@ -117,7 +118,7 @@ def _may_be_errors(priorities: Float32Array) -> bool:
 _SCHEMAS: dict[type, str] = {
     Chunk: "chunk/1",
     InsertReply: "insert_reply/1",
-    SampleRequest: "sample_request/1",
+    SampleRequest: "sample_request/2",
     Samples: "samples/2",
     Priorities: "priorities/1",
     PrioritiesReply: "priorities_reply/1",

@@ -24,8 +24,9 @@ from common.process import (
     joining_arguments,
     run_main,
 )
-from common.trajectory import Float32Array, Weights
+from common.trajectory import Chunk, EpisodeSummary, Float32Array, Weights
 from common.transport import Session
+from common.turns import Turns
 from common.weights import WeightsReader
 from common.wire import encode
 from services.actor.chunker import Origin
@@ -34,6 +35,7 @@ from services.actor.sender import Sender
 from services.replay.client import ReplayWriter, shard_of
 
 _LOG = logging.getLogger("actor")
+_LISTEN_S = 0.2
 
 
 def main(argv: Sequence[str]) -> int:
@@ -55,7 +57,11 @@ def main(argv: Sequence[str]) -> int:
         )
         sender = Sender(writer, config.actor.spool_chunks)
         try:
-            Actor(config, joining, session, sender).run(stop)
+            actor, turns = Actor(config, joining, session, sender), Turns.of(config)
+            if turns is None:
+                actor.run(stop)
+            else:
+                actor.run_in_turns(turns, stop)
         finally:
             stop.set()
             sender.close()
@@ -68,6 +74,7 @@ class Actor:
     def __init__(self, config: Config, joining: Joining, session: Session, sender: Sender) -> None:
         keys, worker = joining.keys, joining.worker
         self._config = config
+        self._worker = worker
         self._sender = sender
         self._reader = WeightsReader(session, keys)
         self._peers = session.presence(keys.everyone("actor"))
@@ -89,17 +96,45 @@ class Actor:
         self._adopt(self._reader.wait(stop, meanwhile=self._report))
         while not stop.is_set():
             self._follow()
-            chunks, episodes = self._collector.step(self._epsilons)
-            for chunk in chunks:
-                waiting_s = time.monotonic()
-                while not self._sender.put(chunk, timeout_s=0.2) and not stop.is_set():
-                    self._reporter.worked(self._sender.heard_s)
-                    self._reporter.maybe(self._metrics)
-                self._waited_s += time.monotonic() - waiting_s
-            for episode in episodes:
-                self._episodes.put(encode(episode))
+            self._tell(*self._collector.step(self._epsilons), stop)
+        self._reporter.now(self._metrics)
+
+    def run_in_turns(self, turns: Turns, stop: StopSignal) -> None:
+        """Collect once for the weights of each turn, until stopped."""
+        self._adopt(self._reader.wait(stop, meanwhile=self._report))
+        done = -1
+        while not stop.is_set():
+            turn = turns.turn(self._policy.learner_step)
+            if turn > done and self._policy.weights_version >= 0:
+                self._take_turn(turn, turns.transitions(turn), stop)
+                done = turn
+            self._sender.check()
+            self._adopt(self._reader.latest(_LISTEN_S))
             self._report()
         self._reporter.now(self._metrics)
+
+    def _take_turn(self, turn: int, transitions: int, stop: StopSignal) -> None:
+        collector = make_collector(self._config, self._worker, self._policy, turn)
+        collector.go_on_counting(self._collector)
+        self._collector, self._epsilons = collector, self._explore()
+        for left in reversed(range(transitions // collector.num_robots)):
+            if stop.is_set():
+                return
+            self._tell(*collector.step(self._epsilons, breaks_off=not left), stop)
+
+    def _tell(
+        self, chunks: Sequence[Chunk], episodes: Sequence[EpisodeSummary], stop: StopSignal
+    ) -> None:
+        """Spool the chunks, publish the episodes."""
+        for chunk in chunks:
+            waiting_s = time.monotonic()
+            while not self._sender.put(chunk, timeout_s=0.2) and not stop.is_set():
+                self._reporter.worked(self._sender.heard_s)
+                self._reporter.maybe(self._metrics)
+            self._waited_s += time.monotonic() - waiting_s
+        for episode in episodes:
+            self._episodes.put(encode(episode))
+        self._report()
 
     def _report(self) -> None:
         self._reporter.worked()
@@ -159,10 +194,16 @@ class Actor:
         }
 
 
-def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
-    """Arenas, codec and chunkers for one actor; its seeds differ by its name."""
+def make_collector(
+    config: Config, worker: str, policy: Policy, turn: int | None = None
+) -> Collector:
+    """Arenas, codec and chunkers for one actor; its seeds differ by its name.
+
+    turn: of a run that takes turns; they differ by it too, and the chunks are known again by it.
+    """
     name_entropy = int.from_bytes(worker.encode(), "little")
-    seeds = np.random.SeedSequence([config.run.seed, name_entropy])
+    entropy = [config.run.seed, name_entropy, *([] if turn is None else [turn])]
+    seeds = np.random.SeedSequence(entropy)
     *arena_seeds, policy_seed = seeds.spawn(config.actor.num_arenas + 1)
     arenas = make_arenas(
         config.arena,
@@ -171,7 +212,7 @@ def make_collector(config: Config, worker: str, policy: Policy) -> Collector:
     )
     origin = Origin(
         actor=worker,
-        incarnation=time.time_ns(),
+        incarnation=time.time_ns() if turn is None else turn,
         gamma=config.agent.gamma,
         n_step=config.agent.n_step,
         stack=config.arena.stack,

@@ -56,11 +56,10 @@ class Collector:
         self._policy = policy
         self._rng = rng
         self._num_robots = config.arena.num_robots
-        num_states = len(arenas) * self._num_robots
         self._chunkers = [
             [Chunker(origin) for _ in range(self._num_robots)] for _ in range(len(arenas))
         ]
-        self._frames = FrameStack(num_states, config.arena.stack, config.arena.view_px)
+        self._frames = FrameStack(self.num_robots, config.arena.stack, config.arena.view_px)
         self._sequence: Iterator[int] = iter(range(2**62))
         self._episodes = [_Episode() for _ in range(len(arenas))]
         self.seconds = Seconds()
@@ -69,12 +68,22 @@ class Collector:
         self._reset(range(len(arenas)))
 
     @property
+    def num_robots(self) -> int:
+        """Of all arenas: transitions of one step."""
+        return len(self._arenas) * self._num_robots
+
+    @property
     def robot_steps(self) -> int:
         """Transitions made."""
         return self.env_steps * self._num_robots
 
-    def step(self, epsilons: Float32Array) -> tuple[list[Chunk], list[EpisodeSummary]]:
-        """One step of every arena, arena e exploring with epsilons[e]."""
+    def step(
+        self, epsilons: Float32Array, *, breaks_off: bool = False
+    ) -> tuple[list[Chunk], list[EpisodeSummary]]:
+        """One step of every arena, arena e exploring with epsilons[e].
+
+        breaks_off: the last one; what is left of all episodes is chunked, as if truncated here.
+        """
         started = time.perf_counter()
         per_robot = np.repeat(epsilons, self._num_robots)
         selection = self._policy.select_actions(self._frames.stacks, per_robot, self._rng)
@@ -89,7 +98,7 @@ class Collector:
             chunk
             for index, time_step in enumerate(time_steps)
             for chunk in self._add(
-                index, actions[index], taken_q[index], greedy_q[index], time_step
+                index, actions[index], taken_q[index], greedy_q[index], time_step, breaks_off
             )
         ]
         mean_q = greedy_q.mean(axis=1)
@@ -112,6 +121,11 @@ class Collector:
         self.seconds.draw += time.perf_counter() - chunked
         return chunks, summaries
 
+    def go_on_counting(self, before: "Collector") -> None:
+        """From what another one counted before."""
+        self.seconds = before.seconds
+        self.env_steps, self.num_episodes = before.env_steps, before.num_episodes
+
     def _add(
         self,
         index: int,
@@ -119,6 +133,7 @@ class Collector:
         taken_q: Float32Array,
         greedy_q: Float32Array,
         time_step: TimeStep,
+        breaks_off: bool,
     ) -> Iterator[Chunk]:
         for robot, chunker in enumerate(self._chunkers[index]):
             yield from chunker.add(
@@ -128,7 +143,7 @@ class Collector:
                 taken_q=float(taken_q[robot]),
                 greedy_q=float(greedy_q[robot]),
                 weights_version=max(self._policy.weights_version, 0),
-                last=time_step.last,
+                last=time_step.last or breaks_off,
                 discount=time_step.discount,
                 sequence=self._sequence,
             )

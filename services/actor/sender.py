@@ -42,13 +42,17 @@ class Sender:
 
         Raises the error that ended the sending: replay refused a chunk, and why.
         """
-        if self._error is not None:
-            raise self._error
+        self.check()
         try:
             self._spool.put(chunk, timeout=timeout_s)
         except queue.Full:
             return False
         return True
+
+    def check(self) -> None:
+        """Raise the error that ended the sending, if one did."""
+        if self._error is not None:
+            raise self._error
 
     def close(self) -> None:
         """Send what is spooled if replay takes it at once, then end the thread."""

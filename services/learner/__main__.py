@@ -21,6 +21,7 @@ from common.process import (
 )
 from common.trajectory import Samples
 from common.transport import Session
+from common.turns import Turns
 from common.weights import WeightsWriter
 from services.learner.batch import Batch, collate, importance_exponent_at
 from services.learner.drawing import make_drawing
@@ -47,6 +48,7 @@ def main(argv: Sequence[str]) -> int:
         settings = config.learner
         torch.set_num_threads(1)  # threads share batches, not operations
         threads = settings.threads or max(1, available_cores() // 2)
+        turns = Turns.of(config)
         learner = Learner(
             config.agent,
             settings,
@@ -55,6 +57,8 @@ def main(argv: Sequence[str]) -> int:
             threads=threads,
         )
         torch.backends.cudnn.benchmark = True  # batches are of one size
+        on_cpu = learner.device.type == "cpu"
+        torch.use_deterministic_algorithms(turns is not None and on_cpu)
         keeper = Keeper(config, learner, joining.run_dir / "checkpoints")
         reader = ReplayReader(
             bulk,
@@ -66,6 +70,7 @@ def main(argv: Sequence[str]) -> int:
             stop,
             num_shards=config.replay.shards,
             seed=settings.seed,
+            learner_step=None if turns is None else learner.learner_step,
         )
         drawing_threads = ThreadPoolExecutor(
             settings.drawing_threads or available_cores(), "drawing"
@@ -116,11 +121,12 @@ def run(
     of publishing or saving numbers that are not finite.
     """
     meter = Meter(learner, prefetcher, priorities, keeper, Vitals(config, learner))
-    limit = config.run.learner_steps
+    limit, turns = config.run.learner_steps, Turns.of(config)
+    publish_period = config.learner.publish_period if turns is None else turns.steps
     try:
         writer.publish(keeper.next_weights())
         while not stop.is_set() and (not limit or learner.learner_step < limit):
-            most = min(learner.updates_per_launch, _steps_to_next_stop(config, learner))
+            most = min(learner.updates_per_launch, _steps_left(learner, publish_period, limit))
             batches = meter.timed("data_wait", partial(prefetcher.next, _POLL_S, most))
             reporter.worked(None if batches else prefetcher.heard_s)
             if batches:
@@ -129,21 +135,24 @@ def run(
                 if priorities is not None:
                     for batch, update in zip(batches, updates, strict=True):
                         priorities.put(batch.keys, update.td_errors)
-                if learner.learner_step % config.learner.publish_period == 0:
+                if learner.learner_step % publish_period == 0:
+                    if turns is not None:  # on the disk before anyone acts by it
+                        meter.timed("checkpoint", keeper.save)
                     meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
-                meter.timed("checkpoint", keeper.maybe_save)
+                if turns is None:
+                    meter.timed("checkpoint", keeper.maybe_save)
             reporter.maybe(meter.metrics)
-        writer.publish(keeper.next_weights())
-        keeper.save()
+        if turns is None:
+            writer.publish(keeper.next_weights())
+            keeper.save()
     finally:
         reporter.now(meter.metrics)
     _LOG.info("stopped at learner step %d", learner.learner_step)
 
 
-def _steps_to_next_stop(config: Config, learner: Learner) -> int:
-    """Until weights are to be published or the run ends."""
-    steps = config.learner.publish_period - learner.learner_step % config.learner.publish_period
-    limit = config.run.learner_steps
+def _steps_left(learner: Learner, publish_period: int, limit: int) -> int:
+    """Until weights are to be published or, with a limit, the run ends."""
+    steps = publish_period - learner.learner_step % publish_period
     return min(steps, limit - learner.learner_step) if limit else steps
 
 

@@ -108,16 +108,18 @@ def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, Ra
     replay.capacity_bytes leave no room for replay.min_size.
     """
     capacity = capacity_of(config)
+    turns = config.run.turn_size > 0
     table = Table(
         capacity=capacity,
         stack=config.arena.stack,
         n_step=config.agent.n_step,
-        chunk_length=config.actor.chunk_length,
+        # In turns the capacity alone decides what goes, not where chunks happen to lie.
+        chunk_length=1 if turns else config.actor.chunk_length,
         record_bytes=config.arena.record_bytes if record_bytes is None else record_bytes,
         sampler=make_sampler(config.replay, capacity),
     )
     limiter = RateLimiter.with_tolerance(
-        config.replay.samples_per_insert,
+        0.0 if turns else config.replay.samples_per_insert,
         config.replay.shard_min_size,
         config.replay.tolerance,
         largest_insert=config.actor.chunk_length,

@@ -97,14 +97,20 @@ class ReplayReader:
         num_shards: int = 1,
         seed: int = 0,
         late_s: float = _RETRY_S,
+        learner_step: int | None = None,
     ) -> None:
-        payload = encode(SampleRequest(batch_size * batches_per_request))
+        """learner_step: of a run that takes turns, the steps made so far; then one request after
+        the other is for the steps that follow.
+        """
+        self._batches_per_request = batches_per_request
+        self._learner_step = -1 if learner_step is None else learner_step
+        in_turns = learner_step is not None
         self._shards = [
             ShardStream(
                 session.client(keys.sample(shard), name, lends=True),
                 name,
-                payload,
-                requests_in_flight,
+                self._request,
+                1 if in_turns else requests_in_flight,
             )
             for shard, name in enumerate(_names(num_shards))
         ]
@@ -114,6 +120,10 @@ class ReplayReader:
         self._rng = np.random.default_rng(seed)
         self._late_s = late_s
         self._stop = stop
+
+    def _request(self) -> bytes:
+        size = self._batch_size * self._batches_per_request
+        return encode(SampleRequest(size, self._learner_step))
 
     @property
     def heard_s(self) -> float:
@@ -150,6 +160,8 @@ class ReplayReader:
             self._patience.spend()
             self._stop.wait(_RETRY_S)
             return iter(())
+        if self._learner_step >= 0:
+            self._learner_step += self._batches_per_request
         if len(self._shards) > 1:
             samples = self._of_all(samples, self._shards.index(drawn), float(share[index]))
         return split_samples(samples, self._batch_size)

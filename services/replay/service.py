@@ -11,11 +11,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+import numpy as np
+
 from common.config import Config
 from common.errors import WireError
 from common.files import reason
 from common.framing import Part, split_set
 from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply
+from common.turns import Turns
 from common.wire import SampleRequest, decode, encode, encode_parts
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
@@ -73,6 +76,7 @@ class ReplayService:
         self._snapshots = (
             None if log is None else SnapshotWriter(log.directory, self.snapshot, period_s)
         )
+        self._turns = Turns.of(config)
         self._book = SequenceBook()
         self._earlier = {"inserts": 0, "samples": 0}  # that the limiter does not count
         self._changed = threading.Condition()
@@ -248,17 +252,35 @@ class ReplayService:
             _LOG.warning("an old file of the log stays: %s", reason(error))
 
     def _sample(self, request: _Request) -> None:
-        size = decode(SampleRequest, request.payload).batch_size
+        asked = decode(SampleRequest, request.payload)
+        size = asked.batch_size
         if not 1 <= size <= self._limiter.largest_sample:
             raise WireError(f"batch_size {size} is outside 1 ... {self._limiter.largest_sample}")
         with self._changed:
-            if not self._wait("sample_held", request, lambda: self._limiter.can_sample(size)):
+            if not self._wait("sample_held", request, lambda: self._can_sample(asked)):
                 request.hold(self._why_no_sample())
                 return
+            if self._turns is not None:
+                seeds = (self._config.replay.seed, asked.learner_step)
+                self._table.sampler.rng = np.random.default_rng(seeds)
             samples = self._table.sample(size, request.room(self._table.sample_bytes(size)))
             self._limiter.samples += size
             self._changed.notify_all()
         request.reply(encode_parts(samples))
+
+    def _can_sample(self, asked: SampleRequest) -> bool:
+        """Raises WireError where it asks for what is not to be had any more, or never was."""
+        if self._turns is None:
+            return self._limiter.can_sample(asked.batch_size)
+        if asked.learner_step < 0:
+            raise WireError("a run that takes turns is asked for the samples of a learner step")
+        inserts, due = self._table.next_key, self._turns.inserts(asked.learner_step)
+        if inserts > due:
+            raise WireError(
+                f"{inserts} transitions where {due} are due at learner step {asked.learner_step}: "
+                "another actor, or a checkpoint that is older than the last turn?"
+            )
+        return inserts == due
 
     def _prioritize(self, request: _Request) -> None:
         message = decode(Priorities, request.payload)

@@ -8,7 +8,7 @@ import logging
 import time
 import zlib
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -42,12 +42,14 @@ def shares(total_priorities: Sequence[float | None]) -> Float64Array:
 
 
 class ShardStream:
-    """Sample requests to one shard; `payload` is each of them."""
+    """Sample requests to one shard; `request` makes the next one."""
 
-    def __init__(self, client: Client, whom: str, payload: bytes, requests_in_flight: int) -> None:
+    def __init__(
+        self, client: Client, whom: str, request: Callable[[], bytes], requests_in_flight: int
+    ) -> None:
         self._client = client
         self._whom = whom
-        self._payload = payload
+        self._request = request
         self._in_flight = requests_in_flight
         self._pending: deque[PendingReply] = deque()
         self._given: PendingReply | None = None  # whose samples are being read
@@ -64,7 +66,7 @@ class ShardStream:
         """Whether an answer is there to be taken; asks ahead, and waits up to `timeout_s`."""
         if time.monotonic() >= self._ask_at_s:
             while len(self._pending) < self._in_flight:
-                asked = self._client.ask(self._payload, reply_bytes=self._reply_bytes)
+                asked = self._client.ask(self._request(), reply_bytes=self._reply_bytes)
                 self._pending.append(asked)
         if self._pending and self._pending[0].wait(timeout_s):
             self.late = False

@@ -101,7 +101,7 @@ def supervise(
         follower = Follower(session, keys, state, recorder, rule)
         for role, count in {
             "learner": 1,
-            "actor": config.run.actors or default_actors(),
+            "actor": num_actors(config),
             "evaluator": config.run.evaluators,
         }.items():
             for index in range(count):
@@ -169,14 +169,17 @@ def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
 
 def expectation(config: Config) -> str:
     """What this machine means for the run, in words."""
-    cores, actors = available_cores(), config.run.actors or default_actors()
+    cores, actors = available_cores(), num_actors(config)
     pace = "" if cores >= _ENOUGH_CORES else ", slower than on the 4 that the docs speak of"
     return f"{cores} cores, {actors} actor{'s' if actors > 1 else ''}{pace}"
 
 
-def default_actors() -> int:
-    """Half the cores, the other half is the learner's; at least 1."""
-    return max(1, available_cores() // 2)
+def num_actors(config: Config) -> int:
+    """As configured, or half the cores, at least 1: the other half is the learner's.
+
+    Of a run that takes turns it is 1.
+    """
+    return config.run.actors or (1 if config.run.turn_size else max(1, available_cores() // 2))
 
 
 def draw(run_dir: Path) -> None:
