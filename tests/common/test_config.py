@@ -182,6 +182,20 @@ IMPOSSIBLE = {
     "epsilon above 1": ({"exploration.schedule": "[[0, 2.0]]"}, "epsilon outside 0 ... 1"),
     "never sampled": ({"replay.min_size": "500_000"}, "sampling would never start"),
     "first batch repeats": ({"replay.min_size": "8"}, "first batch would repeat transitions"),
+    **{
+        f"turns {name}": ({"run.turn_size": "64", **overrides}, f"turn_size [0-9]+ .*{reason}")
+        for name, (overrides, reason) in {
+            "of two actors": ({"run.actors": "2"}, "takes one actor"),
+            "of two shards": ({"replay.shards": "2"}, "takes one replay.shards"),
+            "without a log": ({"replay.fsync": "off"}, "takes a log"),
+            "by priorities": ({"replay.sampler": "prioritized"}, "takes replay.sampler"),
+            "of half a frame": ({"run.turn_size": "72"}, "is no multiple of 16, the robots"),
+            "of half a request": ({"learner.batches_per_request": "5"}, "the learner's request"),
+            "without an end": ({"replay.samples_per_insert": "0"}, "the learner's request"),
+            "broken off": ({"run.learner_steps": "40"}, "multiples of 16, and run.learner_steps"),
+            "beyond the table": ({"replay.capacity": "50_050"}, "does not fit in replay.capacity"),
+        }.items()
+    },
 }
 
 

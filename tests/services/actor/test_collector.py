@@ -101,6 +101,16 @@ def collect(steps: int, *, prioritized: bool = False) -> Collected:
     return Collected(collector, policy, chunks, summaries)
 
 
+def test_a_step_that_breaks_off_leaves_nothing_behind() -> None:
+    collected = collect(9)
+    chunks, summaries = collected.collector.step(EPSILONS, breaks_off=True)
+    num_robots = collected.collector.num_robots
+    assert num_robots == ARENAS * ROBOTS
+    assert sum(map(len, collected.chunks + chunks)) == 10 * num_robots
+    lasts = [chunk for chunk in chunks if chunk.discounts[-1] == np.float32(0.99)]
+    assert len(lasts) == num_robots - ROBOTS * len(summaries), "as if truncated: bootstrapped"
+
+
 @pytest.fixture(scope="module")
 def collected() -> Collected:
     return collect(STEPS)

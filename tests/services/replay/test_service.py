@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from common.config import Config, ReplayConfig, TransportConfig
+from common.config import Config, ReplayConfig, RunConfig, TransportConfig
 from common.framing import Part, join_set
 from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples, Stats
 from common.wire import SampleRequest, decode, encode, encode_parts
@@ -118,9 +118,11 @@ def replay(
     buffer: float = 0.0,
     hold_s: float = _DEADLINE_S,
     prioritized: bool = False,
+    turn_size: int = 0,
 ) -> Iterator[Replay]:
     config = Config(
-        replay=ReplayConfig(capacity=1000, min_size=100, hold_s=hold_s),
+        replay=ReplayConfig(capacity=1000, min_size=96, hold_s=hold_s),
+        run=RunConfig(turn_size=turn_size),
         transport=TransportConfig(timeout_s=2 * hold_s),
     )
     rng = np.random.default_rng(0)
@@ -367,6 +369,33 @@ def test_a_request_that_waited_in_the_queue_is_answered_at_once() -> None:
         request = FakeRequest(encode(SampleRequest(BATCH)), time.monotonic() - 3601.0)
         up.samples.put(request)
         assert request.answer()[0] == "hold"
+
+
+def test_in_turns_a_learner_step_is_given_the_same_samples_however_often_it_asks() -> None:
+    def keys(up: Replay, learner_step: int) -> list[int]:
+        answer = up.samples.ask(encode(SampleRequest(BATCH, learner_step))).answer()
+        return sampled_keys(answer)
+
+    with replay(turn_size=64) as up:  # 96 + 64 transitions are due in the first turn
+        waiting = up.samples.ask(encode(SampleRequest(BATCH, 0)))
+        for sequence in range(160 // LENGTH):
+            assert waiting.answers.empty()
+            up.insert(chunk_bytes(sequence))
+        first = sampled_keys(waiting.answer())
+        assert keys(up, 3) != first
+        assert keys(up, 0) == first
+        kind, reason = up.sample()
+        assert (kind, "of a learner step" in str(reason)) == ("refuse", True)
+        up.insert(chunk_bytes(160 // LENGTH))
+        kind, reason = up.samples.ask(encode(SampleRequest(BATCH, 0))).answer()
+        assert (kind, "165 transitions where 160 are due" in str(reason)) == ("refuse", True)
+
+
+def sampled_keys(answer: tuple[str, bytes | str]) -> list[int]:
+    kind, payload = answer
+    assert kind == "reply"
+    assert isinstance(payload, bytes)
+    return decode(Samples, payload).keys.tolist()
 
 
 def test_stop_answers_what_is_held_and_ends_the_threads() -> None:

@@ -1,0 +1,23 @@
+"""Who is due to do what in a run that takes turns."""
+
+from common.config import Config, load_config
+from common.turns import Turns
+
+OVERRIDES = {
+    "run.turn_size": "64",
+    "run.learner_steps": "0",
+    "replay.min_size": "201",
+    "replay.capacity": "300",
+}
+
+
+def test_a_turn_is_so_many_transitions_and_the_steps_that_they_are_sampled_for() -> None:
+    turns = Turns.of(load_config("smoke", OVERRIDES, environ={}))
+    assert turns == Turns(first=208, size=64, steps=8)  # whole frames of 8 robots; 4 samples each
+    assert [turns.turn(step) for step in (0, 7, 8, 16)] == [0, 0, 1, 2]
+    assert [turns.transitions(turn) for turn in (0, 1, 2)] == [272, 64, 64]
+    assert [turns.inserts(step) for step in (0, 7, 8, 16)] == [272, 272, 336, 400]
+
+
+def test_by_default_all_go_at_their_own_pace() -> None:
+    assert Turns.of(Config()) is None
