@@ -11,6 +11,7 @@ import argparse
 import hashlib
 import math
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -26,6 +27,7 @@ import numpy as np
 
 from benchmarks.machine import emit
 from common.config import TransportConfig
+from common.files import RUN_CONFIG
 from common.keys import Keys
 from common.live import LivePolicy
 from common.network import weights_to_bytes
@@ -37,17 +39,19 @@ from services.evaluator.__main__ import Judge
 from services.train.fleet import ALLOCATOR
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
-# One robot with small pictures: learned within the minutes that the kills take.
-SETTINGS = (
+SMALL_RUN = (
     "--arena.num_robots=1",
     "--arena.view_px=40",
     "--arena.max_frames=300",
     "--exploration.schedule=[[0, 1.0], [4000, 0.1]]",
     "--replay.min_size=2000",
+    "--evaluator.episodes=50",
+)
+OFTEN = (
     "--learner.publish_period=25",
     "--learner.checkpoint_period_s=5",
     "--evaluator.period_s=5",
-    "--evaluator.episodes=50",
+    "--run.learner_steps=0",
 )
 DURING_START = 5  # each so many-th kill is followed by one while the learner starts
 _ROBOTS = 2  # that act by a LivePolicy, each with a session of its own
@@ -61,11 +65,15 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=300, help="of the learner between kills")
     parser.add_argument("--longest", type=float, default=5.0, help="seconds more, at random")
+    parser.add_argument("--trained", type=Path, help="go on from a copy of this run's checkpoints")
     arguments = parser.parse_args()
+    small = ["--config", "quick", *SMALL_RUN]
+    trained = ["--config", f"{arguments.trained}/{RUN_CONFIG}"]
     with tempfile.TemporaryDirectory() as folder:
         found = ordeal(
             Path(folder),
-            ["--config", "quick", *SETTINGS],
+            [*(trained if arguments.trained else small), *OFTEN],
+            checkpoints=arguments.trained and arguments.trained / "checkpoints",
             kills=arguments.kills,
             seed=arguments.seed,
             steps=arguments.steps,
@@ -76,17 +84,26 @@ def main() -> int:
 
 
 def ordeal(
-    folder: Path, configured: Sequence[str], *, kills: int, seed: int, steps: int, longest_s: float
+    folder: Path,
+    configured: Sequence[str],
+    *,
+    kills: int,
+    seed: int,
+    steps: int,
+    longest_s: float,
+    checkpoints: Path | None = None,
 ) -> dict[str, Any]:
     """What came of so many kills.
 
     configured: flags of replay, with the configuration. steps: that the learner makes at least
-    between two kills. longest_s: and so many seconds more, at random.
+    between two kills. longest_s: and so many seconds more, at random. checkpoints: to begin with.
     """
     rng = random.Random(seed)
     name, endpoint, began_s = run_name("kills"), free_endpoint(), time.monotonic()
     here = ["--run", name, "--run-dir", str(folder)]
     joining = [*here, "--connect", endpoint, "--id"]
+    if checkpoints is not None:
+        shutil.copytree(checkpoints, folder / name / "checkpoints")
 
     def process(role: str) -> Command:
         return Command([role, *joining, f"{role}-0"], folder, **ALLOCATOR)
