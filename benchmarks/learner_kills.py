@@ -159,8 +159,9 @@ def ordeal(
         "learner_steps": follower.learner_step,
         "published": len(follower.published),
         "epochs": len({weights.epoch for weights in follower.published}),
-        "went_back": follower.went_back() + [line for r in robots for line in r.went_back()],
-        "mixed": [line for robot in robots for line in robot.mixed(follower.digests())],
+        "went_back": follower.went_back()
+        + [line for r in robots for line in backwards("acted by", [o for o, _ in r.acted])],
+        "mixed": [line for robot in robots for line in mixed(robot.acted, follower.digests())],
         "acted_by": [len(robot.acted) for robot in robots],
         "evaluations": [
             (e.learner_step, e.weights_version, e.success_rate) for e in follower.judged
@@ -260,23 +261,33 @@ class Follower:
 
     def went_back(self) -> list[str]:
         """A line for each that came after a newer one: on the wire, taken, judged, acted by."""
-        lines = [
-            f"published {b.order} after {a.order}"
-            for a, b in pairwise(self.published)
-            if b.order <= a.order
-        ]
-        lines += [
-            f"taken {b.order} after {a.order}"
-            for a, b in pairwise(self.taken)
-            if b.order <= a.order
-        ]
         judged = [(e.weights_epoch, e.weights_version) for e in self.judged]
-        lines += [f"judged {b} after {a}" for a, b in pairwise(judged) if b < a]
+        lines = backwards("published", [weights.order for weights in self.published])
+        lines += backwards("taken", [weights.order for weights in self.taken])
+        lines += backwards("judged", judged, again=True)
         for role, versions in self.told.items():
-            lines += [f"{role} at {b} after {a}" for a, b in pairwise(versions) if b < a]
+            lines += backwards(role, [(0, version) for version in versions], again=True)
         if self._reader.refused:
             lines.append(f"{self._reader.refused} messages refused")
         return lines
+
+
+def backwards(what: str, orders: Sequence[Order], *, again: bool = False) -> list[str]:
+    """A line for each that is not above the one before it; again: the same may come."""
+    return [
+        f"{what}: {after} after {before}"
+        for before, after in pairwise(orders)
+        if after < before or (after == before and not again)
+    ]
+
+
+def mixed(acted: Sequence[tuple[Order, str]], digests: dict[Order, str]) -> list[str]:
+    """A line for each version whose parameters, as acted by, are not those published."""
+    return [
+        f"acted by {order}, and not as it was published"
+        for order, digest in acted
+        if digests.get(order, digest) != digest
+    ]
 
 
 class Robot:
@@ -304,17 +315,6 @@ class Robot:
             if not self.acted or self.acted[-1][0] != order:
                 payload = weights_to_bytes(policy.network)
                 self.acted.append((order, hashlib.sha256(payload).hexdigest()))
-
-    def went_back(self) -> list[str]:
-        return [f"acted by {b} after {a}" for (a, _), (b, _) in pairwise(self.acted) if b <= a]
-
-    def mixed(self, digests: dict[Order, str]) -> list[str]:
-        """A line for each version whose parameters, as acted by, are not those published."""
-        return [
-            f"acted by {order}, and not as it was published"
-            for order, digest in self.acted
-            if digests.get(order, digest) != digest
-        ]
 
 
 @contextmanager

@@ -1,90 +1,39 @@
-"""The learner is killed again and again: versions never go back, and training goes on."""
+"""The learner is killed again and again: versions never go back, and training goes on.
 
-import signal
+The ordeal is that of benchmarks/learner_kills.py, which kills as often as one likes.
+"""
+
 from pathlib import Path
 
 import pytest
 
-from common.config import TransportConfig
-from common.keys import Keys
-from common.trajectory import Evaluation, Weights
-from common.transport import Session, free_endpoint
-from common.weights import WeightsReader
-from common.wire import decode
-from tests.system.system_processes import SMALL, Command, end_all, eventually, run_name
+from benchmarks.learner_kills import Order, backwards, mixed, ordeal
+from tests.system.system_processes import SMALL
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
-KILLS = 3
-MORE = 20  # learner steps between two of them
+KILLS, STEPS = 3, 20
 
 
-class Follower:
-    """Hears all that is published of weights and evaluations, and what a reader makes of it."""
-
-    def __init__(self, session: Session, keys: Keys) -> None:
-        self._reader = WeightsReader(session, keys)
-        self._published = session.queue_subscriber(keys.weights)
-        self._evaluations = session.queue_subscriber(keys.every_evaluation)
-        self.taken: list[Weights] = []
-        self.published: list[Weights] = []
-        self.judged: list[int] = []
-
-    def listen(self) -> None:
-        """For half a second at most, or until the reader has newer weights."""
-        newer = self._reader.latest(0.5)
-        self.taken += [newer] if newer else []
-        while (item := self._published.take(0.0)) is not None:
-            self.published.append(decode(Weights, item[1]))
-        while (item := self._evaluations.take(0.0)) is not None:
-            self.judged.append(decode(Evaluation, item[1]).weights_version)
-        assert self._reader.refused == 0
-
-    def reaches(self, learner_step: int) -> bool:
-        self.listen()
-        return bool(self.taken) and self.taken[-1].learner_step >= learner_step
-
-    def has_judged(self, version: int) -> bool:
-        self.listen()
-        return bool(self.judged) and self.judged[-1] >= version
-
-
+@pytest.mark.system
 def test_versions_never_go_back_and_training_goes_on(tmp_path: Path) -> None:
-    name, endpoint = run_name("kills"), free_endpoint()
-    here = ["--run", name, "--run-dir", tmp_path]
-    joining = [*here, "--connect", endpoint, "--id"]
-    serving = ["replay", *here, "--config", "smoke", "--listen", endpoint, *SMALL]
-    try:
-        with (
-            Command([*serving, "--run.learner_steps=0"], tmp_path),
-            Session(TransportConfig(connect=(endpoint,)), open_timeout_s=120) as session,
-            Command(["actor", *joining, "actor-0"], tmp_path),
-            Command(["evaluator", *joining, "evaluator-0"], tmp_path),
-        ):
-            follower, reached = Follower(session, Keys(name)), 0
-            versions_at_kill = []
-            for _ in range(KILLS):
-                with Command(["learner", *joining, "learner-0"], tmp_path) as learner:
-                    due = reached + MORE
-                    eventually(lambda due=due: follower.reaches(due), f"learner step {due}")
-                    learner.signal(signal.SIGKILL)
-                    assert learner.wait() == -signal.SIGKILL
-                follower.listen()
-                reached = follower.taken[-1].learner_step
-                versions_at_kill.append(follower.taken[-1].version)
-            with Command(["learner", *joining, "learner-0"], tmp_path) as learner:
-                due = reached + MORE
-                eventually(lambda: follower.reaches(due), f"learner step {due}")
-                newest = follower.taken[-1].version
-                eventually(lambda: follower.has_judged(newest), f"version {newest} is judged")
-                learner.signal(signal.SIGTERM)
-                assert learner.wait() == 0, learner.err
-                assert "going on from" in learner.err
-    finally:
-        end_all(name)
-    orders = [weights.order for weights in follower.published]
-    assert orders == sorted(set(orders)), "nothing older, nothing twice, not even on the wire"
-    assert len({weights.epoch for weights in follower.published}) == 1
-    assert follower.judged == sorted(follower.judged)
-    assert versions_at_kill == sorted(set(versions_at_kill))
-    assert newest > versions_at_kill[-1]
+    configured = ["--config", "smoke", *SMALL, "--run.learner_steps=0"]
+    found = ordeal(tmp_path, configured, kills=KILLS, seed=0, steps=STEPS, longest_s=0.5)
+    assert found["kills"] == KILLS
+    assert (found["went_back"], found["mixed"]) == ([], [])
+    assert found["epochs"] == 1
+    assert found["learner_steps"] >= (KILLS + 1) * STEPS
+    assert found["published"] > KILLS
+    assert min(found["acted_by"]) > KILLS
+    assert len(found["resumed"]) == KILLS
+    assert found["evaluations"]
+    assert found["ended"] == (0, True), "in order, and from a checkpoint"
+
+
+def test_the_ordeal_would_notice() -> None:
+    orders: list[Order] = [(1, 1), (1, 10_002), (1, 10_002), (1, 3), (0, 20_000)]
+    assert len(backwards("taken", orders)) == 3
+    assert len(backwards("judged", orders, again=True)) == 2
+    digests = {(1, 1): "one", (1, 2): "two"}
+    acted = [((1, 1), "one"), ((1, 2), "one"), ((1, 3), "never heard of")]
+    assert mixed(acted, digests) == ["acted by (1, 2), and not as it was published"]
