@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from benchmarks.machine import emit
 from common.config import TransportConfig
@@ -150,6 +151,7 @@ def ordeal(
             seconds = time.monotonic() - began_s
     finally:
         end_all(name)
+    torch.set_num_threads(config.evaluator.threads)
     judge = Judge(config, "judge")
     return {
         "kills": kills + kills // DURING_START,
