@@ -18,6 +18,7 @@ _COMMANDS = {
     "status": ("services.train.status", "what a run that is up does, and what limits it"),
     "router": ("services.router.__main__", "relay between the processes of runs"),
     "actor": ("services.actor.__main__", "collect for a run that is up"),
+    "simulate": ("services.actor.simulate.__main__", "the load of many actors on replay"),
     "learner": ("services.learner.__main__", "learn for a run that is up"),
     "evaluator": ("services.evaluator.__main__", "judge the live weights of a run that is up"),
 }

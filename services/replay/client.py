@@ -45,6 +45,10 @@ class ReplayWriter:
         self._client = session.client(keys.insert(shard), name, lends=True)
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
+        self.held = 0
+        """Answers that said: not now."""
+        self.unanswered = 0
+        """Requests whose time was over, or that brought no reply one could read."""
 
     @property
     def heard_s(self) -> float:
@@ -67,8 +71,10 @@ class ReplayWriter:
                 pending.release()
                 return reply
             except HeldError:
+                self.held += 1
                 self._patience.renew()
             except (DeadlineError, WireError):
+                self.unanswered += 1
                 self._patience.spend()
                 self._stop.wait(_RETRY_S)
             if self._stop.is_set():
