@@ -50,9 +50,10 @@ PLACES = {
     ),
 }
 
-# The dashboard is no process: the launcher shows and records a run by its modules, and the
-# evaluator's commands draw by them.
+# The dashboard is no process: the launcher shows and records a run by its modules, the evaluator's
+# commands draw by them, and simulate names the machine as a run's summary does.
 DRAWN_BY_DASHBOARD = {
+    "services/actor": {"summary"},
     "services/train": {"limiting", "recorder", "screen", "state", "stopping"},
     "services/evaluator": {"figures", "film", "paper"},
 }
@@ -154,6 +155,7 @@ HEAVY = {"torch", "cv2", "numba", "pymunk", "matplotlib", "av", "safetensors", "
         ("services.replay.client", HEAVY),
         ("services.train.__main__", {"torch", "safetensors"}),
         ("services.train.status", HEAVY - {"rich"}),
+        ("services.actor.simulate.__main__", HEAVY),
         ("common.heartbeat", {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}),
     ],
 )
