@@ -32,7 +32,7 @@ LARGE_BYTES = 32 << 10  # below, the network is as fast
 _NAME = "mrcdrl-slot"
 _ADDRESS = re.compile(r"([0-9a-f-]{36}) (\d{1,10}) (\d{1,10}) ([0-9a-f]{32})")
 _TOKEN_BYTES = 16
-_MAX_MAPPED = 64
+_MAX_MAPPED = 1024  # one or two a client; memory of the dead goes when the next is mapped
 _SEALS = (
     fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL if sys.platform == "linux" else 0
 )

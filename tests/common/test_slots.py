@@ -54,6 +54,12 @@ def test_nothing_is_left_of_a_slot() -> None:
     assert open_descriptors() == before
 
 
+def test_the_slots_of_many_clients_are_mapped_once() -> None:
+    slots, lent = Slots(), [Slot(10) for _ in range(300)]
+    mapped = [slots.open(slot.address) for slot in lent]
+    assert all(slots.open(s.address) is m for s, m in zip(lent, mapped, strict=True))
+
+
 def test_slots_of_the_dead_are_forgotten() -> None:
     slots, slot, other = Slots(), Slot(10), Slot(10)
     first = slot.address
