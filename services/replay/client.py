@@ -21,6 +21,7 @@ __all__ = ["PriorityWriter", "ReplayReader", "ReplayWriter", "shard_of", "split_
 
 _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2
+_LONGEST_RETRY_S = 3.2
 _LAST_ANSWER_S = 1.0  # for an answer under way when told to stop
 
 
@@ -62,7 +63,9 @@ class ReplayWriter:
         """
         parts = join_set([encode_parts(chunk) for chunk in chunks])
         self._patience.renew()
+        retry_s = _RETRY_S
         while True:
+            asked_s = time.monotonic()
             try:
                 pending = self._client.ask(parts)
                 if not _answered(pending, self._stop, _LAST_ANSWER_S):
@@ -73,6 +76,9 @@ class ReplayWriter:
             except HeldError:
                 self.held += 1
                 self._patience.renew()
+                if time.monotonic() - asked_s < _RETRY_S:  # too many wait there already
+                    self._stop.wait(retry_s)
+                    retry_s = min(2 * retry_s, _LONGEST_RETRY_S)
             except (DeadlineError, WireError):
                 self.unanswered += 1
                 self._patience.spend()

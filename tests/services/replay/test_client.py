@@ -1,0 +1,72 @@
+"""The writer's patience with a replay service at which too many wait already."""
+
+import numpy as np
+import pytest
+
+from common.errors import HeldError
+from common.keys import Keys
+from common.process import StopSignal
+from common.trajectory import Chunk, InsertReply
+from common.wire import encode
+from services.replay import client
+from services.replay.client import ReplayWriter
+
+
+class FakeReplay:
+    """Session, client and answer in one: holds so many requests at once, then acknowledges."""
+
+    def __init__(self, holds: int) -> None:
+        self.holds = holds
+
+    def client(self, *_: object, **__: object) -> "FakeReplay":
+        return self
+
+    def ask(self, _: object) -> "FakeReplay":
+        return self
+
+    def wait(self, _: float) -> bool:
+        return True
+
+    def result(self) -> bytes:
+        self.holds -= 1
+        if self.holds >= 0:
+            raise HeldError("256 requests are waiting")
+        return encode(InsertReply(0, False, 3))
+
+    def release(self) -> None:
+        pass
+
+
+class Waits(StopSignal):
+    """Notes what is waited, and waits for nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seconds: list[float] = []
+
+    def wait(self, timeout_s: float) -> bool:
+        self.seconds.append(timeout_s)
+        return False
+
+
+def insert(holds: int, stop: StopSignal) -> ReplayWriter:
+    octets, floats = np.ones(3, np.uint8), np.ones(3, np.float32)
+    chunk = Chunk("a", 1, 0, 0, np.zeros((4, 4), np.uint8), octets, floats, floats, octets, floats)
+    writer = ReplayWriter(FakeReplay(holds), Keys("run"), 10.0, stop)  # type: ignore[arg-type]
+    assert writer.insert([chunk]) is not None
+    return writer
+
+
+def test_who_is_sent_away_at_once_asks_less_and_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client.time, "monotonic", lambda: 100.0)
+    stop = Waits()
+    assert insert(7, stop).held == 7
+    assert stop.seconds == pytest.approx([0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2])
+
+
+def test_who_was_let_wait_asks_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter(range(0, 1000, 5))
+    monkeypatch.setattr(client.time, "monotonic", lambda: float(next(seconds)))
+    stop = Waits()
+    assert insert(3, stop).held == 3
+    assert stop.seconds == []
