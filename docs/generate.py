@@ -1,20 +1,31 @@
-"""Writes docs/configuration.md from the schema: `python docs/generate.py`.
+"""Writes docs/configuration.md, and the tables of docs/scaling.md: `python docs/generate.py`.
 
 Invariants: the schema's docstrings are the only place where a setting is described; a setting
-without a source, in brackets at the end of its description, is refused.
+without a source, in brackets at the end of its description, is refused; no figure of the tables is
+written by hand.
 """
 
+import json
 import re
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
 from common.config import Config, load_config, preset_names, sections, to_toml
+from services.actor.simulate import scaling
+from services.actor.simulate.scaling import Pace
 
 TARGET = Path(__file__).with_name("configuration.md")
+SCALING = Path(__file__).with_name("scaling.md")
+TRIALS = Path(__file__).parents[1] / "benchmarks" / "results" / "simulate"
+_TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.S)
+_RATE = 4300.0  # robot steps per second of an actor with a core of its own: docs/profile.md
+_UPDATES = 81.4  # per second of a learner on two cores: benchmarks/results/learner
+_ACTORS = (10, 100, 1000)
 _SOURCE = re.compile(r"^(?P<text>.*?)\s*\((?P<source>[^()]*)\)$")
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -134,6 +145,105 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
+# -- scaling.md --------------------------------------------------------------------------
+
+
+def render_scaling(text: str) -> str:
+    """The page with its tables written anew."""
+    tables = {"flows": _flows, "needs": _needs, "trials": _trials}
+    return _TABLE.sub(lambda m: "".join([m[1], *tables[m[2]](), m[3]]), text)
+
+
+def _row(*cells: object) -> str:
+    return f"| {' | '.join(map(str, cells))} |\n"
+
+
+def _head(*cells: str) -> str:
+    return _row(*cells) + "|---" * len(cells) + "|\n"
+
+
+def _records() -> dict[str, Config]:
+    """The preset quick with each kind of records."""
+    return {c: load_config("quick", {"arena.codec": c}, environ={}) for c in ("scene", "frames")}
+
+
+def _flows() -> Iterator[str]:
+    """What one actor adds."""
+    scene, frames = (scaling.flows(c, Pace.free(1, _RATE)) for c in _records().values())
+    yield _head(
+        *("flow", "way", "bytes, `scene`", "bytes, `frames`", "messages/s"),
+        "processor, ms a message",
+    )
+    for small, large in zip(scene, frames, strict=True):
+        sizes = (f"{flow.message_bytes:,.0f}" for flow in (small, large))
+        per_s = "1 a publication" if small.name == "weights" else f"{small.per_s:,.1f}"
+        whose = small.processor
+        cost = "" if whose is None else f"{1000 * whose[1]:.2f}, {whose[0]}'s"
+        yield _row(small.name, small.way, *sizes, per_s, cost)
+
+
+def _needs() -> Iterator[str]:
+    """What is there to be for many."""
+    yield _head(
+        *("records, pace", "actors", "transitions/s", "replay, cores", "router, cores"),
+        *("router, MB/s", "shards", "routers", "first full"),
+    )
+    for codec, config in _records().items():
+        for pace in ("held", "free"):
+            for actors in _ACTORS:
+                given = (
+                    Pace.held(config, actors, _RATE, _UPDATES)
+                    if pace == "held"
+                    else Pace.free(actors, _RATE)
+                )
+                yield _need(f"`{codec}`, {pace}", config, given)
+    spared = load_config(
+        "quick",
+        {"learner.publish_precision": "bfloat16", "learner.publish_period": "500"},
+        environ={},
+    )
+    yield _need("`scene`, held, weights spared", spared, Pace.held(spared, 1000, _RATE, _UPDATES))
+
+
+def _need(title: str, config: Config, pace: Pace) -> str:
+    need = scaling.need(config, pace)
+    return _row(
+        title,
+        pace.actors,
+        f"{pace.transitions_per_s:,.0f}",
+        f"{need.replay_cores:.2f}",
+        f"{need.relay_cores:.2f}",
+        f"{need.relay_bytes_per_s / 1e6:,.0f}",
+        need.shards,
+        need.routers,
+        need.first,
+    )
+
+
+def _trials() -> Iterator[str]:
+    """What was measured, beside what the model says of replay's process."""
+    yield _head(
+        *("trial", "actors", "transitions/s", "inserts/s", "insert p50, p99, ms", "held"),
+        *("weights, MB/s", "replay, cores", "by the model", "replay, MiB"),
+    )
+    for path in sorted(TRIALS.glob("*.json")):
+        figures = json.loads(path.read_text("utf-8"))
+        replay, latency = figures["processes"]["replay-0"], figures["insert_ms"]
+        yield _row(
+            f"`{path.stem}`",
+            figures["actors"],
+            f"{figures['transitions_per_s']:,.0f}",
+            f"{figures['inserts_per_s']:,.0f}",
+            f"{latency['p50']:,.1f}, {latency['p99']:,.0f}",
+            f"{figures['held']:,}",
+            f"{figures['weights_bytes_per_s'] / 1e6:,.0f}",
+            f"{replay['cores']:.2f}",
+            f"{scaling.expected(figures):.2f}",
+            f"{replay['memory_mib']:,.0f}",
+        )
+
+
 if __name__ == "__main__":
     TARGET.write_text(render(), "utf-8")
-    sys.stdout.write(f"{TARGET} written\n")
+    SCALING.write_text(render_scaling(SCALING.read_text("utf-8")), "utf-8")
+    sys.stdout.write(f"{TARGET} and {SCALING} written\n")

@@ -112,6 +112,11 @@ def test_configuration_is_up_to_date() -> None:
     assert page("configuration.md") == generate().render(), "run: python docs/generate.py"
 
 
+def test_tables_of_scaling_are_up_to_date() -> None:
+    written = page("scaling.md")
+    assert generate().render_scaling(written) == written, "run: python docs/generate.py"
+
+
 def test_settings_named_in_the_docs_exist() -> None:
     known = {f"{s}.{f}" for s, info in Config.model_fields.items() for f in _fields(info)}
     sections = "|".join(Config.model_fields)
