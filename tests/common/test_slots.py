@@ -55,7 +55,7 @@ def test_nothing_is_left_of_a_slot() -> None:
 
 
 def test_the_slots_of_many_clients_are_mapped_once() -> None:
-    slots, lent = Slots(), [Slot(10) for _ in range(300)]
+    slots, lent = Slots(), [Slot(10) for _ in range(100)]
     mapped = [slots.open(slot.address) for slot in lent]
     assert all(slots.open(s.address) is m for s, m in zip(lent, mapped, strict=True))
 
