@@ -48,14 +48,19 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_config_flags(
-    parser: argparse.ArgumentParser, short: Mapping[str, str] | None = None
+    parser: argparse.ArgumentParser,
+    short: Mapping[str, str] | None = None,
+    *,
+    only: Sequence[str] = (),
 ) -> None:
     """A flag for every field of the configuration.
 
-    short: shorter spellings, such as {"arena.num_robots": "--robots"}.
+    short: shorter spellings, such as {"arena.num_robots": "--robots"}. only: these sections.
     """
     shorter = short or {}
     for section, model in sections().items():
+        if only and section not in only:
+            continue
         group = parser.add_argument_group(f"[{section}]")
         for name, info in model.model_fields.items():
             text = re.sub(r"\s+", " ", info.description or "").replace("%", "%%")

@@ -411,6 +411,13 @@ class TransportConfig(Section):
     """Endpoints to connect to, such as tcp/127.0.0.1:7447. (ours)"""
     listen: tuple[str, ...] = ()
     """Endpoints to listen on; the replay process of one machine. (ours)"""
+    ca: str = ""
+    """The certificate of the authority that the others' certificates are of, a PEM file. With it,
+    certificate and key, endpoints are tls/HOST:PORT and everyone shows a certificate. (ours)"""
+    certificate: str = ""
+    """This process's own, a PEM file; its common name is the role it may play. (ours)"""
+    key: str = ""
+    """The private key of the certificate, a PEM file. (ours)"""
     timeout_s: Positive = 10.0
     """Deadline of one query. (ours)"""
     max_message_bytes: Count = 64 << 20
@@ -418,6 +425,12 @@ class TransportConfig(Section):
     shared_memory: bool = True
     """Large messages between processes of one host go through memory that they share, where both
     can reach it; over the network otherwise. (ours)"""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len({bool(self.ca), bool(self.certificate), bool(self.key)}) > 1:
+            raise ValueError("ca, certificate and key are given together or not at all")
+        return self
 
 
 class Config(Section):

@@ -18,7 +18,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import TransportConfig
+from common.config import load_transport
 from common.errors import CheckpointError, DeadlineError
 from common.policy import FrameStack, make_policy
 from common.process import Joining, StopSignal, fetch_config
@@ -51,7 +51,8 @@ class LivePolicy:
         self._foreign = 0
         self._fresh = np.ones(0, np.bool_)
         self._adopted_s = time.monotonic()
-        transport, stop = TransportConfig(connect=(endpoint,)), StopSignal()
+        transport = load_transport({}).model_copy(update={"connect": (endpoint,), "listen": ()})
+        stop = StopSignal()
         joining = Joining(run, "live", Path(), transport, {})
         with contextlib.ExitStack() as opened:
             session = opened.enter_context(Session(transport, open_timeout_s=timeout_s))

@@ -17,6 +17,7 @@ _COMMANDS = {
     "replay inspect": ("services.replay.inspect", "what the replay log of a run holds"),
     "status": ("services.train.status", "what a run that is up does, and what limits it"),
     "router": ("services.router.__main__", "relay between the processes of runs"),
+    "certs": ("services.router.certs", "certificates for trials, one for each role"),
     "actor": ("services.actor.__main__", "collect for a run that is up"),
     "simulate": ("services.actor.simulate.__main__", "the load of many actors on replay"),
     "learner": ("services.learner.__main__", "learn for a run that is up"),

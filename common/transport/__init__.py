@@ -2,15 +2,18 @@
 
 from common.transport.publications import LatestSubscriber, Presence, Publisher, QueueSubscriber
 from common.transport.queries import Client, PendingReply, Request, Server
-from common.transport.session import Session, free_endpoint
+from common.transport.refusals import Refusals
+from common.transport.session import ROUTER_FILE, Session, free_endpoint
 
 __all__ = [
+    "ROUTER_FILE",
     "Client",
     "LatestSubscriber",
     "PendingReply",
     "Presence",
     "Publisher",
     "QueueSubscriber",
+    "Refusals",
     "Request",
     "Server",
     "Session",

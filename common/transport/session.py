@@ -7,38 +7,79 @@ declared. What Zenoh loses and when: docs/wire.md.
 
 import contextlib
 import json
+import logging
 import re
 import socket
 import time
+from importlib import resources
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import zenoh
 
 from common.config import TransportConfig
-from common.errors import EndpointError
+from common.errors import ConfigError, EndpointError
 from common.transport.publications import LatestSubscriber, Presence, Publisher, QueueSubscriber
 from common.transport.queries import Client, Server
 from common.transport.slots import Lender
 
+ROUTER_FILE = Path(str(resources.files("configs"))) / "router.json5"
+_LOG = logging.getLogger("transport")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
-_OPEN_ATTEMPT_MS = 2_000
-# How long a full link holds up its sender before it is closed. A router gives up soon: a peer that
-# is stopped would hold up all others, until they lose their leases (10 s) too.
-_PATIENCE_US = {"router": 5_000_000, "client": 60_000_000}
+_ENCRYPTED = "tls/"
+_LOOPBACK = re.compile(r"[a-z]+/(127\.|\[::1\]|localhost:)")
+_CLIENT_SETTINGS: dict[str, Any] = {
+    "mode": "client",
+    "connect/timeout_ms": 2_000,  # of one attempt
+    "connect/exit_on_failure": True,
+    "connect/retry": {
+        "period_init_ms": 200,
+        "period_max_ms": 1000,
+        "period_increase_factor": 1.5,
+    },
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/link/tx/queue/size/data": 16,
+    # A full link holds up its sender for so long, µs, before it is closed.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
+    "transport/shared_memory/enabled": False,  # our own, in slots.py, has no pool to overflow
+    "transport/link/tls/enable_mtls": True,
+    "transport/link/tls/close_link_on_expiration": True,
+}
 
 
 class Session:
     """An open Zenoh session: a router where it listens, a client otherwise.
 
-    Raises EndpointError when an endpoint cannot be listened on, or nobody answers where it
-    connects within `open_timeout_s`.
+    router_file: what to be as a router; by default configs/router.json5. `config` says where to
+    listen and connect, if it says so at all.
+
+    Raises EndpointError when an endpoint cannot be listened on, nobody answers where it connects
+    within `open_timeout_s`, or certificates are missing; ConfigError for a bad `router_file`.
     """
 
-    def __init__(self, config: TransportConfig, *, open_timeout_s: float = 30.0) -> None:
+    def __init__(
+        self,
+        config: TransportConfig,
+        *,
+        open_timeout_s: float = 30.0,
+        router_file: Path | None = None,
+    ) -> None:
         self._config = config
-        self._session = _open(config, time.monotonic() + open_timeout_s)
+        routes = bool(config.listen or router_file)
+        settings = _read(router_file or ROUTER_FILE) if routes else zenoh.Config()
+        self._listen = config.listen or (_endpoints(settings, "listen") if routes else ())
+        self._connect = config.connect or (_endpoints(settings, "connect") if routes else ())
+        _check_endpoints(config, (*self._listen, *self._connect))
+        ends = {"listen/endpoints": self._listen, "connect/endpoints": self._connect}
+        how = _router_settings(config) if routes else _CLIENT_SETTINGS
+        for key, value in (how | ends | _certificates(config)).items():
+            settings.insert_json5(key, json.dumps(value))
+        self._session = self._open(settings, time.monotonic() + open_timeout_s)
         self._declared = contextlib.ExitStack()
+        if self._listen:
+            self._say_who_may_join()
 
     def __enter__(self) -> Self:
         return self
@@ -119,8 +160,38 @@ class Session:
         self._declared.callback(declared.undeclare)
         return declared
 
+    def _open(self, settings: zenoh.Config, deadline: float) -> zenoh.Session:
+        while True:
+            try:
+                return zenoh.open(settings)
+            except zenoh.ZError as error:
+                if self._listen:
+                    raise EndpointError(
+                        f"cannot listen on {', '.join(self._listen)}: in use, or not an address of "
+                        f"this machine ({_first_line(error)})"
+                    ) from error
+                if time.monotonic() > deadline:
+                    refused = ", or does not accept this certificate" * bool(self._config.key)
+                    raise EndpointError(
+                        f"nobody answers at {', '.join(self._connect)}{refused}; is the run up? "
+                        f"({_first_line(error)})"
+                    ) from error
+
+    def _say_who_may_join(self) -> None:
+        where = ", ".join(self._listen)
+        if self._config.key:
+            _LOG.info("listening on %s, encrypted, for certificates of %s", where, self._config.ca)
+        elif all(map(_LOOPBACK.match, self._listen)):
+            _LOG.info("listening on %s, not encrypted: for this machine only", where)
+        else:
+            _LOG.warning(
+                "listening on %s, not encrypted: whoever reaches it can read and alter every run; "
+                "docs/security.md says how to change that",
+                where,
+            )
+
     def __repr__(self) -> str:
-        ends = self._config.listen or self._config.connect
+        ends = self._listen or self._connect
         state = "closed" if self._session.is_closed() else "open"
         return f"<Session {', '.join(ends)} {state}>"
 
@@ -132,54 +203,63 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def _open(config: TransportConfig, deadline: float) -> zenoh.Session:
-    if not config.listen and not config.connect:
-        raise EndpointError("no endpoint: give --connect or --listen, such as tcp/127.0.0.1:7447")
-    for endpoint in (*config.listen, *config.connect):
-        if not _ENDPOINT.fullmatch(endpoint):
-            raise EndpointError(f"{endpoint!r} is no endpoint; write one as tcp/127.0.0.1:7447")
-    while True:
-        try:
-            return zenoh.open(_zenoh_config(config))
-        except zenoh.ZError as error:
-            if config.listen:
-                raise EndpointError(
-                    f"cannot listen on {', '.join(config.listen)}: in use, or not an address of "
-                    f"this machine ({_first_line(error)})"
-                ) from error
-            if time.monotonic() > deadline:
-                raise EndpointError(
-                    f"nobody answers at {', '.join(config.connect)}; is the run up? "
-                    f"({_first_line(error)})"
-                ) from error
-
-
 def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:120]
 
 
-def _zenoh_config(config: TransportConfig) -> zenoh.Config:
-    result = zenoh.Config()
-    mode = "router" if config.listen else "client"
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "listen/endpoints": list(config.listen),
-        "connect/endpoints": list(config.connect),
-        "connect/timeout_ms": _OPEN_ATTEMPT_MS,
-        "connect/exit_on_failure": True,
-        "connect/retry": {
-            "period_init_ms": 200,
-            "period_max_ms": 1000,
-            "period_increase_factor": 1.5,
-        },
-        "listen/timeout_ms": 0,
-        "listen/exit_on_failure": True,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/link/tx/queue/size/data": 16,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": _PATIENCE_US[mode],
-        "transport/shared_memory/enabled": False,  # our own, in slots.py, has no pool to overflow
+def _endpoints(settings: zenoh.Config, side: str) -> tuple[str, ...]:
+    return tuple(json.loads(settings.get_json(f"{side}/endpoints")))
+
+
+def _check_endpoints(config: TransportConfig, endpoints: tuple[str, ...]) -> None:
+    """Raises EndpointError where one is missing, wrong, or not as secure as configured."""
+    if not endpoints:
+        raise EndpointError("no endpoint: give --connect or --listen, such as tcp/127.0.0.1:7447")
+    for endpoint in endpoints:
+        if not _ENDPOINT.fullmatch(endpoint):
+            raise EndpointError(f"{endpoint!r} is no endpoint; write one as tcp/127.0.0.1:7447")
+        if config.key and not endpoint.startswith(_ENCRYPTED):
+            raise EndpointError(
+                f"{endpoint} is not encrypted, but transport.certificate is given; "
+                f"write {_ENCRYPTED}{endpoint.partition('/')[2]}"
+            )
+        if endpoint.startswith(_ENCRYPTED) and not config.key:
+            raise EndpointError(
+                f"{endpoint} needs transport.ca, transport.certificate and transport.key; "
+                "`mrcdrl certs` makes some for trials"
+            )
+    for name in ("ca", "certificate", "key"):
+        try:
+            if path := getattr(config, name):
+                Path(path).read_bytes()
+        except OSError as error:
+            raise EndpointError(f"transport.{name} {path}: {error.strerror}") from error
+
+
+def _read(file: Path) -> zenoh.Config:
+    try:
+        return zenoh.Config.from_json5(file.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"config '{file}': {getattr(error, 'strerror', error)}") from error
+    except zenoh.ZError as error:
+        raise ConfigError(f"config '{file}': {_first_line(error)}") from error
+
+
+def _router_settings(config: TransportConfig) -> dict[str, Any]:
+    """What the router's file leaves to this process."""
+    return {
+        "access_control/enabled": bool(config.key),
+        "transport/link/rx/max_message_size": 2 * config.max_message_bytes,
     }
-    for key, value in settings.items():
-        result.insert_json5(key, json.dumps(value))
-    return result
+
+
+def _certificates(config: TransportConfig) -> dict[str, str]:
+    if not config.key:
+        return {}
+    return {
+        "transport/link/tls/root_ca_certificate": config.ca,
+        "transport/link/tls/listen_certificate": config.certificate,
+        "transport/link/tls/listen_private_key": config.key,
+        "transport/link/tls/connect_certificate": config.certificate,
+        "transport/link/tls/connect_private_key": config.key,
+    }

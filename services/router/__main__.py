@@ -1,16 +1,16 @@
 """`mrcdrl router`: a Zenoh router, to which all processes of a run connect."""
 
-import logging
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
 
-from common.arguments import Parser
-from common.config import TransportConfig
+from common.arguments import Parser, add_config_flags, overrides
+from common.config import load_transport
 from common.heartbeat import Heartbeat
 from common.process import STOP_DEADLINE_S, StopSignal, run_main
-from common.transport import Session
+from common.transport import ROUTER_FILE, Refusals, Session
 
-_LOG = logging.getLogger("router")
 _TICK_S = 1.0
 
 
@@ -18,17 +18,29 @@ def main(argv: Sequence[str]) -> int:
     """Relay until told to stop; the exit code."""
     parser = Parser(prog="mrcdrl router", description="Relay between the processes of runs.")
     parser.add_argument(
-        "--listen", action="append", required=True, help="endpoint, such as tcp/0.0.0.0:7447"
+        "--config", type=Path, default=ROUTER_FILE, help="a file such as configs/router.json5"
+    )
+    parser.add_argument(
+        "--listen",
+        action="append",
+        help="endpoint, such as tcp/0.0.0.0:7447; by default the file's",
     )
     parser.add_argument("--connect", action="append", help="another router's endpoint, to link to")
+    add_config_flags(parser, only=("transport",))
     arguments = parser.parse_args(argv)
-    transport = TransportConfig(
-        listen=tuple(arguments.listen), connect=tuple(arguments.connect or ())
+    given = load_transport(overrides(arguments))
+    transport = given.model_copy(
+        update={
+            "listen": tuple(arguments.listen or given.listen),
+            "connect": tuple(arguments.connect or given.connect),
+        }
     )
     heartbeat = Heartbeat.of_environment()
     stop = StopSignal().listen(STOP_DEADLINE_S)
-    with Session(transport):
-        _LOG.info("listening on %s", ", ".join(transport.listen))
+    with ExitStack() as owned:
+        if transport.key:
+            owned.enter_context(Refusals())
+        owned.enter_context(Session(transport, router_file=arguments.config))
         while not stop.wait(_TICK_S):
             heartbeat.worked()
             heartbeat.beat()

@@ -333,3 +333,9 @@ def test_the_environment_counts_in_a_service_that_joins() -> None:
     environ = {"MRCDRL_LEARNER__THREADS": "3", "MRCDRL_LEARNER__SEED": "4"}
     joined = apply_overrides(table, {"learner.seed": "5"}, environ)
     assert (joined.learner.threads, joined.learner.seed) == (3, 5)
+
+
+@pytest.mark.parametrize("name", ["ca", "certificate", "key"])
+def test_certificates_are_given_together(name: str) -> None:
+    with pytest.raises(ConfigError, match="ca, certificate and key are given together"):
+        load_transport({f"transport.{name}": "file.pem"}, environ={})

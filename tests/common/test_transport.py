@@ -5,15 +5,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from common.config import TransportConfig
-from common.errors import DeadlineError, EndpointError, HeldError, RefusedError
+from common.errors import ConfigError, DeadlineError, EndpointError, HeldError, RefusedError
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Weights
-from common.transport import Client, Publisher, Server, Session, free_endpoint
+from common.transport import ROUTER_FILE, Client, Publisher, Server, Session, free_endpoint
 from common.weights import WeightsReader, WeightsWriter
 
 _DEADLINE_S = 20.0
@@ -412,3 +413,75 @@ def test_a_free_endpoint_is_free() -> None:
 def test_a_malformed_endpoint_is_refused_at_once(endpoint: str) -> None:
     with pytest.raises(EndpointError, match="is no endpoint"):
         Session(TransportConfig(connect=(endpoint,)))
+
+
+def test_an_encrypted_endpoint_needs_certificates() -> None:
+    with pytest.raises(EndpointError, match=r"needs transport\.ca, transport\.certificate and"):
+        Session(TransportConfig(connect=("tls/127.0.0.1:7447",)), open_timeout_s=0.0)
+
+
+@pytest.mark.parametrize("side", ["listen", "connect"])
+def test_who_has_certificates_speaks_in_the_clear_to_nobody(certificates: Path, side: str) -> None:
+    files = {"ca": "ca.pem", "certificate": "certificate.pem", "key": "key.pem"}
+    given = {name: str(certificates / "router" / file) for name, file in files.items()}
+    config = TransportConfig.model_validate({side: ("tcp/127.0.0.1:7447",), **given})
+    with pytest.raises(EndpointError, match=r"is not encrypted, .* write tls/127\.0\.0\.1:7447"):
+        Session(config, open_timeout_s=0.0)
+
+
+def test_a_certificate_that_is_not_there_is_named(certificates: Path) -> None:
+    config = TransportConfig(
+        connect=("tls/127.0.0.1:7447",),
+        ca=str(certificates / "actor" / "ca.pem"),
+        certificate=str(certificates / "actor" / "certificate.pem"),
+        key=str(certificates / "nobody" / "key.pem"),
+    )
+    with pytest.raises(EndpointError, match=r"transport\.key .*nobody.*: No such file"):
+        Session(config, open_timeout_s=0.0)
+
+
+@pytest.mark.parametrize(
+    ("host", "level", "said"),
+    [("127.0.0.1", "INFO", "for this machine only"), ("0.0.0.0", "WARNING", "whoever reaches it")],
+)
+def test_who_listens_in_the_clear_says_so(
+    caplog: pytest.LogCaptureFixture, host: str, level: str, said: str
+) -> None:
+    endpoint = free_endpoint().replace("127.0.0.1", host)
+    with caplog.at_level("INFO"), Session(TransportConfig(listen=(endpoint,))):
+        [record] = [r for r in caplog.records if r.name == "transport"]
+    assert record.levelname == level
+    assert said in record.message
+
+
+def test_a_router_listens_where_its_file_says(tmp_path: Path) -> None:
+    endpoint, file = free_endpoint(), tmp_path / "router.json5"
+    file.write_text(ROUTER_FILE.read_text().replace("tcp/127.0.0.1:7447", endpoint))
+    with (
+        Session(TransportConfig(), router_file=file),
+        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=_DEADLINE_S) as peer,
+    ):
+        assert "open" in repr(peer)
+
+
+@pytest.mark.parametrize("content", ["{mode: ", '{mode: "wanderer"}', "{nonsense: 1}"])
+def test_a_bad_router_file_is_one_line(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "router.json5"
+    file.write_text(content)
+    with pytest.raises(ConfigError, match=r"router\.json5") as refused:
+        Session(TransportConfig(), router_file=file)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(ConfigError, match="No such file"):
+        Session(TransportConfig(), router_file=tmp_path / "none.json5")
+
+
+def test_a_linked_router_waits_for_the_other() -> None:
+    """Started in either order, they link."""
+    first, second = free_endpoint(), free_endpoint()
+    with Session(TransportConfig(listen=(second,), connect=(first,))) as router:
+        server = router.server(KEY)
+        with (
+            Session(TransportConfig(listen=(first,))),
+            Session(TransportConfig(connect=(first,))) as peer,
+        ):
+            until_served(peer, KEY, server)
