@@ -31,6 +31,9 @@ RUN pip --python /opt/mrcdrl/bin/python install --no-compile --no-deps --force-r
  && /opt/mrcdrl/bin/python -c "import common.heartbeat, services.cli, services.replay.__main__, \
       services.replay.inspect, services.router.__main__, services.train.status"
 
+FROM small-installed AS certs-installed
+RUN pip --python /opt/mrcdrl/bin/python install cryptography
+
 FROM installer AS learning-installed
 RUN --mount=type=bind,from=wheels,target=/wheels pip --python /opt/mrcdrl/bin/python install \
     --find-links /wheels "$(grep '^torch==' constraints.txt)"
@@ -51,7 +54,7 @@ LABEL org.opencontainers.image.title="mrcdrl" \
       org.opencontainers.image.version="${VERSION}" \
       org.opencontainers.image.revision="${REVISION}"
 RUN useradd --uid 10001 --user-group --no-create-home --home-dir /tmp mrcdrl \
- && install --directory --owner=mrcdrl --group=mrcdrl /runs /var/cache/mrcdrl
+ && install --directory --owner=mrcdrl --group=mrcdrl /runs /certs /var/cache/mrcdrl
 ENV PATH=/opt/mrcdrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
     MRCDRL_HEARTBEAT=/tmp/heartbeat
 WORKDIR /
@@ -74,7 +77,11 @@ RUN python -m common.arena
 # -- one target a service -----------------------------------------------------------------------------
 
 FROM small AS router
-CMD ["router", "--listen", "tcp/0.0.0.0:7447"]
+CMD ["router", "--help"]
+
+FROM service AS certs
+COPY --from=certs-installed /opt/mrcdrl /opt/mrcdrl
+CMD ["certs", "--help"]
 
 FROM small AS replay
 CMD ["replay", "--help"]

@@ -86,7 +86,7 @@ def check_possible(config: Config) -> None:
     """
     test_starts(config.arena, 1, config.evaluator.seed)
     if config.transport.listen:
-        Session(TransportConfig(listen=config.transport.listen)).close()
+        Session(config.transport.model_copy(update={"connect": ()})).close()
 
 
 def supervise(

@@ -124,8 +124,7 @@ class Stack:
     def status(self) -> dict[str, Any]:
         """What `mrcdrl status --json` says now."""
         said = self.compose(
-            *("exec", "--no-TTY", "status", "mrcdrl", "status", "--run", "stack"),
-            *("--connect", "tcp/router:7447", "--json"),
+            *("exec", "--no-TTY", "status", "mrcdrl", "status", "--run", "stack", "--json")
         )
         told: dict[str, Any] = json.loads(said)
         return told

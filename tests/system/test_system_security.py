@@ -170,8 +170,6 @@ def test_a_run_trains(secured: Secured, tmp_path: Path) -> None:
             )
 
         eventually(trained, "the run learns, acts by its weights and judges them")
-        for process in (watching, *reversed(others), learner, replay):
-            assert process.end() == 0, process.err
     assert f"mrcdrl/{name}" not in secured.process.err, "the router refused something of the run"
 
 
