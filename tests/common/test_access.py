@@ -1,8 +1,8 @@
 """Who may send what, by configs/router.json5, with real sessions over TLS on loopback.
 
-Each role tries everything, and exactly what its row allows comes through. The router of this
-process is the other side. What comes later on the same connection, a question or an answer, shows
-that what did not come by then was refused.
+Each role tries everything, and exactly what its row allows comes through. The other side has a
+router's certificate, with which all is allowed. What comes later on the same connection, a
+question or an answer, shows that what did not come by then was refused.
 """
 
 import datetime
@@ -96,32 +96,39 @@ def transport(certificates: Path, role: str, **ends: tuple[str, ...]) -> Transpo
     )
 
 
-@pytest.fixture
-def endpoint() -> str:
+def tls_endpoint() -> str:
     return free_endpoint().replace("tcp/", "tls/")
 
 
+@pytest.fixture(scope="module")
+def endpoint(certificates: Path) -> Iterator[str]:
+    """Of a router that all tests here share."""
+    where = tls_endpoint()
+    with Session(transport(certificates, "router", listen=(where,))):
+        yield where
+
+
 @pytest.fixture
-def router(certificates: Path, endpoint: str) -> Iterator[Session]:
-    with Session(transport(certificates, "router", listen=(endpoint,))) as session:
+def other(certificates: Path, endpoint: str) -> Iterator[Session]:
+    with Session(transport(certificates, "router", connect=(endpoint,))) as session:
         yield session
 
 
 @dataclass
 class Pair:
-    """A role's session, and the router's of this process."""
+    """A role's session, and the other side's."""
 
     role: str
     own: Session
-    router: Session
+    other: Session
 
     def __post_init__(self) -> None:
         if "config" in MAY[self.role].serve:
             self._server = self.own.server(RUN.config)
-            self._client = self.router.client(RUN.config, self.role, _PATIENCE_S)
+            self._client = self.other.client(RUN.config, self.role, _PATIENCE_S)
         else:
-            self._server = self.router.server(RUN.config)
-            self._client = self.own.client(RUN.config, "the router", _PATIENCE_S)
+            self._server = self.other.server(RUN.config)
+            self._client = self.own.client(RUN.config, "the other side", _PATIENCE_S)
 
     def settle(self) -> None:
         """Return when all that was sent on the connection before, either way, has been judged."""
@@ -140,11 +147,11 @@ class Pair:
 
 @pytest.fixture
 def pair(
-    request: pytest.FixtureRequest, certificates: Path, endpoint: str, router: Session
+    request: pytest.FixtureRequest, certificates: Path, endpoint: str, other: Session
 ) -> Iterator[Pair]:
     role = request.param
     with Session(transport(certificates, role, connect=(endpoint,))) as own:
-        joined = Pair(role, own, router)
+        joined = Pair(role, own, other)
         joined.settle()
         yield joined
 
@@ -182,13 +189,13 @@ def answered(asker: Session, server: Server, settle: Callable[[], None], key: st
 
 @every_role
 def test_publishing(pair: Pair) -> None:
-    came = came_through(PUBLISHED, lambda key: published(pair.own, pair.router, pair.settle, key))
+    came = came_through(PUBLISHED, lambda key: published(pair.own, pair.other, pair.settle, key))
     assert set(came) == set(MAY[pair.role].put)
 
 
 @every_role
 def test_following(pair: Pair) -> None:
-    came = came_through(PUBLISHED, lambda key: published(pair.router, pair.own, pair.settle, key))
+    came = came_through(PUBLISHED, lambda key: published(pair.other, pair.own, pair.settle, key))
     assert set(came) == set(MAY[pair.role].follow)
 
 
@@ -196,7 +203,7 @@ def test_following(pair: Pair) -> None:
 def test_asking(pair: Pair) -> None:
     asked = {name: key for name, key in SERVED.items() if name != "config"}
     came = came_through(
-        asked, lambda key: answered(pair.own, pair.router.server(key), pair.settle, key)
+        asked, lambda key: answered(pair.own, pair.other.server(key), pair.settle, key)
     )
     assert {*came, "config"} == {*MAY[pair.role].ask, "config"}
 
@@ -205,14 +212,14 @@ def test_asking(pair: Pair) -> None:
 def test_serving(pair: Pair) -> None:
     served = {name: key for name, key in SERVED.items() if name != "config"}
     came = came_through(
-        served, lambda key: answered(pair.router, pair.own.server(key), pair.settle, key)
+        served, lambda key: answered(pair.other, pair.own.server(key), pair.settle, key)
     )
     assert set(came) == set(MAY[pair.role].serve) - {"config"}
 
 
 @every_role
 def test_being_there(pair: Pair) -> None:
-    presence = pair.router.presence(RUN.everyone())
+    presence = pair.other.presence(RUN.everyone())
     for key in LIVE.values():
         pair.own.announce(key)
     pair.settle()
@@ -222,7 +229,7 @@ def test_being_there(pair: Pair) -> None:
 @every_role
 def test_seeing_who_is_there(pair: Pair) -> None:
     for key in LIVE.values():
-        pair.router.announce(key)
+        pair.other.announce(key)
     seen = {name: pair.own.presence(RUN.everyone(name.removeprefix("live "))) for name in LIVE}
     everyone = pair.own.presence(RUN.everyone())
     pair.settle()
@@ -234,7 +241,7 @@ def test_seeing_who_is_there(pair: Pair) -> None:
 @pytest.mark.parametrize("pair", ["status"], indirect=True)
 @pytest.mark.parametrize("key", ["mrcdrl/**", "mrcdrl/*/weights", "**", "mrcdrl/access/stats/**"])
 def test_a_wider_key_reaches_no_further(pair: Pair, key: str) -> None:
-    followed, publisher = pair.own.queue_subscriber(key), pair.router.publisher(RUN.weights)
+    followed, publisher = pair.own.queue_subscriber(key), pair.other.publisher(RUN.weights)
     pair.settle()
     publisher.put(b"payload")
     pair.settle()
@@ -243,7 +250,7 @@ def test_a_wider_key_reaches_no_further(pair: Pair, key: str) -> None:
 
 @pytest.mark.parametrize("pair", ["actor"], indirect=True)
 def test_a_statistic_too_large_is_dropped(pair: Pair) -> None:
-    followed = pair.router.queue_subscriber(RUN.episodes("w"))
+    followed = pair.other.queue_subscriber(RUN.episodes("w"))
     publisher = pair.own.publisher(RUN.episodes("w"))
     pair.settle()
     publisher.put(bytes((1 << 20) + 1))
@@ -254,7 +261,7 @@ def test_a_statistic_too_large_is_dropped(pair: Pair) -> None:
 
 @pytest.mark.parametrize("pair", ["actor"], indirect=True)
 def test_statistics_too_often_are_dropped(pair: Pair) -> None:
-    followed = pair.router.queue_subscriber(RUN.stats("actor", "w"))
+    followed = pair.other.queue_subscriber(RUN.stats("actor", "w"))
     publisher = pair.own.publisher(RUN.stats("actor", "w"))
     pair.settle()
     for _ in range(1000):
@@ -264,7 +271,8 @@ def test_statistics_too_often_are_dropped(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("role", ["replay", "actor"])
-def test_only_a_router_is_believed_to_be_one(certificates: Path, endpoint: str, role: str) -> None:
+def test_only_a_router_is_believed_to_be_one(certificates: Path, role: str) -> None:
+    endpoint = tls_endpoint()
     with (
         Session(transport(certificates, role, listen=(endpoint,))),
         pytest.raises(EndpointError, match="nobody answers"),
@@ -273,14 +281,14 @@ def test_only_a_router_is_believed_to_be_one(certificates: Path, endpoint: str, 
 
 
 def test_a_certificate_of_no_role_may_do_nothing(
-    certificates: Path, tmp_path: Path, endpoint: str, router: Session
+    certificates: Path, tmp_path: Path, endpoint: str, other: Session
 ) -> None:
     shutil.copytree(certificates / "ca", tmp_path / "ca")
     make(tmp_path, ["visitor"], ["localhost"], datetime.timedelta(days=1))
-    server = router.server(RUN.config)
+    server = other.server(RUN.config)
     with (
         Session(transport(tmp_path, "visitor", connect=(endpoint,))) as visitor,
         pytest.raises(DeadlineError),
     ):
-        visitor.client(RUN.config, "the router", 5.0).ask(b"").result()
+        visitor.client(RUN.config, "the other side", 5.0).ask(b"").result()
     assert server.take(0.0) is None
