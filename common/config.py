@@ -220,6 +220,12 @@ class ExplorationConfig(Section):
     """Points (learner step, epsilon), linear between, constant after the last. (paper)"""
     ladder_power: Annotated[float, Field(ge=1)] = 3.0
     """Power of the least exploring arena. (ours; Ape-X: 8 with 360 actors)"""
+    slots: Annotated[int, Field(ge=0)] = 0
+    """Places of the ladder, each leased to one actor; 0: as many as there are actors that hold
+    one. (ours; Ape-X: as many as actors)"""
+    lease_s: Annotated[float, Field(ge=1)] = 15.0
+    """An actor that is not heard of for so long loses its slot; it renews three times as often.
+    (ours)"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

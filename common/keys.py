@@ -4,6 +4,7 @@ mrcdrl/<run>/replay/<shard>/insert     query: Chunk -> InsertReply
 mrcdrl/<run>/replay/<shard>/sample     query: SampleRequest -> Samples
 mrcdrl/<run>/replay/<shard>/priorities query: Priorities -> PrioritiesReply
 mrcdrl/<run>/config                    query: nothing -> the configuration as TOML
+mrcdrl/<run>/leases                    query: LeaseRequest -> LeaseReply
 mrcdrl/<run>/weights                   publication and query: Weights
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
@@ -50,6 +51,10 @@ class Keys:
     @property
     def config(self) -> str:
         return f"mrcdrl/{self.run}/config"
+
+    @property
+    def leases(self) -> str:
+        return f"mrcdrl/{self.run}/leases"
 
     @property
     def weights(self) -> str:

@@ -27,6 +27,7 @@ from common.heartbeat import Heartbeat
 from common.keys import Keys, check_name
 from common.trajectory import Stats
 from common.transport import Publisher, Session
+from common.versions import versions
 from common.wire import encode
 
 ENDPOINT_FILE = "endpoint"
@@ -184,7 +185,7 @@ class StatsReporter:
         self._publisher = publisher
         self._role = role
         self._worker = worker
-        self._text = {"incarnation": str(time.time_ns())}
+        self._text = {"incarnation": str(time.time_ns()), **versions()}
         self._heartbeat = Heartbeat.of_environment()
         self._due_s = 0.0
 
@@ -202,7 +203,8 @@ class StatsReporter:
         self._due_s = time.monotonic() + 1.0
         try:
             numbers = {name: float(value) for name, value in metrics().items()}
-            self._publisher.put(encode(Stats(self._role, self._worker, numbers, self._text)))
+            text = {**self._text, "clock_ns": str(time.time_ns())}
+            self._publisher.put(encode(Stats(self._role, self._worker, numbers, text)))
         except TransportError as error:
             logging.getLogger(self._role).warning("stats not published: %s", error)
         self._heartbeat.beat()

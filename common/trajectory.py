@@ -24,6 +24,7 @@ Int64Array = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 NUM_ACTIONS = 3  # left, straight, right (paper section 3)
+NO_SLOT = -1  # of an actor to which no slot of exploration is leased
 
 
 class StepType(IntEnum):
@@ -158,6 +159,27 @@ class PrioritiesReply:
 
     updated: int
     ignored: int  # of transitions evicted meanwhile; all of them where sampling is uniform
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseRequest:
+    """An actor's wish for a slot of exploration: a first one, its own again, or to give it back."""
+
+    actor: str
+    incarnation: int  # differs for every start of the actor
+    slot: int  # it had last; NO_SLOT where it had none
+    holds: bool  # by its own clock that slot is its own still
+    ends: bool  # it needs none any more
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseReply:
+    """Replay's answer: the slot that is the actor's own for `lease_s` from when it asked."""
+
+    slot: int  # NO_SLOT: none now, ask again
+    rank: int  # its place on the ladder
+    num_places: int  # of the ladder
+    lease_s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,12 +23,15 @@ from common.errors import WireError
 from common.framing import Part, join_map, padded, split_map
 from common.keys import MAX_NAME
 from common.trajectory import (
+    NO_SLOT,
     NUM_ACTIONS,
     Chunk,
     EpisodeSummary,
     Evaluation,
     Float32Array,
     InsertReply,
+    LeaseReply,
+    LeaseRequest,
     Priorities,
     PrioritiesReply,
     Samples,
@@ -104,6 +107,26 @@ def _check_priorities(message: Priorities) -> str | None:
     return None
 
 
+def _check_lease_request(request: LeaseRequest) -> str | None:
+    if len(request.actor) > MAX_NAME:  # replay remembers it
+        return f"actor has more than {MAX_NAME} characters"
+    if request.slot < NO_SLOT:
+        return f"slot is below {NO_SLOT}"
+    if request.holds and request.slot == NO_SLOT:
+        return "it holds a slot and names none"
+    return None
+
+
+def _check_lease_reply(reply: LeaseReply) -> str | None:
+    if reply.slot < NO_SLOT:
+        return f"slot is below {NO_SLOT}"
+    if not 0 <= reply.rank < reply.num_places:
+        return f"rank {reply.rank} is none of {reply.num_places} places"
+    if not 0 < reply.lease_s < math.inf:
+        return "lease_s is not above 0 and finite"
+    return None
+
+
 def _check_weights(weights: Weights) -> str | None:
     if hashlib.sha256(weights.payload).hexdigest() != weights.digest:
         return "the payload is not what its digest says: torn or altered"
@@ -122,6 +145,8 @@ _SCHEMAS: dict[type, str] = {
     Samples: "samples/2",
     Priorities: "priorities/1",
     PrioritiesReply: "priorities_reply/1",
+    LeaseRequest: "lease_request/1",
+    LeaseReply: "lease_reply/1",
     Weights: "weights/2",
     EpisodeSummary: "episode/1",
     Evaluation: "evaluation/1",
@@ -131,6 +156,8 @@ _CHECKS: dict[type, Callable[[Any], str | None]] = {
     Chunk: _check_chunk,
     Samples: _check_samples,
     Priorities: _check_priorities,
+    LeaseRequest: _check_lease_request,
+    LeaseReply: _check_lease_reply,
     Weights: _check_weights,
 }
 

@@ -31,6 +31,7 @@ from common.weights import WeightsReader
 from common.wire import encode
 from services.actor.chunker import Origin
 from services.actor.collector import Collector
+from services.actor.lease import WHOLE_LADDER, LeaseKeeper, Place
 from services.actor.sender import Sender
 from services.replay.client import ReplayWriter, shard_of
 
@@ -56,14 +57,16 @@ def main(argv: Sequence[str]) -> int:
             num_shards=num_shards,
         )
         sender = Sender(writer, config.actor.spool_chunks)
+        lease = LeaseKeeper(session, joining.keys, joining.worker, config.exploration.lease_s)
         try:
-            actor, turns = Actor(config, joining, session, sender), Turns.of(config)
+            actor, turns = Actor(config, joining, session, sender, lease), Turns.of(config)
             if turns is None:
                 actor.run(stop)
             else:
                 actor.run_in_turns(turns, stop)
         finally:
             stop.set()
+            lease.give_back()
             sender.close()
     return 0
 
@@ -71,14 +74,20 @@ def main(argv: Sequence[str]) -> int:
 class Actor:
     """The shell around a collector."""
 
-    def __init__(self, config: Config, joining: Joining, session: Session, sender: Sender) -> None:
+    def __init__(
+        self,
+        config: Config,
+        joining: Joining,
+        session: Session,
+        sender: Sender,
+        lease: LeaseKeeper,
+    ) -> None:
         keys, worker = joining.keys, joining.worker
         self._config = config
         self._worker = worker
         self._sender = sender
+        self._lease = lease
         self._reader = WeightsReader(session, keys)
-        self._peers = session.presence(keys.everyone("actor"))
-        self._live_key = keys.live("actor", worker)
         self._episodes = session.publisher(keys.episodes(worker))
         self._reporter = StatsReporter(
             session.publisher(keys.stats("actor", worker)), "actor", worker
@@ -86,7 +95,7 @@ class Actor:
         self._policy = make_policy(config, resolve_device(config.actor.device, "actor.device"))
         self._collector = make_collector(config, worker, self._policy)
         self._adopted_s = time.monotonic()
-        self._epsilons = self._explore()
+        self._epsilons = self._explore(lease.place)
         self._waited_s = 0.0
         self._refused = 0  # weights of another network
         self._started_s = time.monotonic()
@@ -116,7 +125,7 @@ class Actor:
     def _take_turn(self, turn: int, transitions: int, stop: StopSignal) -> None:
         collector = make_collector(self._config, self._worker, self._policy, turn)
         collector.go_on_counting(self._collector)
-        self._collector, self._epsilons = collector, self._explore()
+        self._collector, self._epsilons = collector, self._explore(WHOLE_LADDER)
         for left in reversed(range(transitions // collector.num_robots)):
             if stop.is_set():
                 return
@@ -129,6 +138,7 @@ class Actor:
         for chunk in chunks:
             waiting_s = time.monotonic()
             while not self._sender.put(chunk, timeout_s=0.2) and not stop.is_set():
+                self._lease.follow()
                 self._reporter.worked(self._sender.heard_s)
                 self._reporter.maybe(self._metrics)
             self._waited_s += time.monotonic() - waiting_s
@@ -137,14 +147,16 @@ class Actor:
         self._report()
 
     def _report(self) -> None:
+        self._lease.follow()
         self._reporter.worked()
         self._reporter.maybe(self._metrics)
 
     def _follow(self) -> None:
-        """Adopt newer weights, and explore as their step and the number of actors say."""
+        """Adopt newer weights, and explore as their step and the place on the ladder say."""
         adopted = self._adopt(self._reader.latest())
-        if adopted or any(True for _ in self._peers.changes()):
-            self._epsilons = self._explore()
+        self._lease.follow()
+        if adopted or self._lease.place != self._place:
+            self._epsilons = self._explore(self._lease.place)
 
     def _adopt(self, weights: Weights | None) -> bool:
         """Act by these weights from now on, unless there are none or they are foreign."""
@@ -159,14 +171,13 @@ class Actor:
         self._adopted_s = time.monotonic()
         return True
 
-    def _explore(self) -> Float32Array:
-        """Epsilon of each arena; an actor's rank is its place among the names of those alive."""
-        names = sorted(self._peers.alive() | {self._live_key})
+    def _explore(self, place: Place) -> Float32Array:
+        """Epsilon of each arena."""
+        self._place = place
         return epsilons(
             self._config.exploration,
             self._policy.learner_step,
-            names.index(self._live_key),
-            len(names),
+            *place,
             self._config.actor.num_arenas,
         )
 
@@ -184,6 +195,7 @@ class Actor:
             "weights_version": self._policy.weights_version,
             "weights_age_s": now - self._adopted_s,
             "weights_refused": self._reader.refused + self._refused,
+            "slot": self._lease.slot,
             "epsilon_min": float(self._epsilons.min()),
             "epsilon_max": float(self._epsilons.max()),
             "inference_share": seconds.inference / lived_s,

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from services.dashboard.limiting import thousands
-from services.dashboard.state import RunState, Service
+from services.dashboard.state import WITHOUT_FIGURES, RunState, Service
 
 QUIET_S = 5.0  # after so long without a word a service is shown as silent
 ROLE_STYLES = {"actor": "cyan", "replay": "blue", "learner": "magenta", "evaluator": "green"}
@@ -61,6 +61,8 @@ def heard(service: Service, now: float) -> Text:
     silent = service.silent_s(now)
     if not service.alive:
         return Text("gone", style="bold red")
+    if service.role in WITHOUT_FIGURES:
+        return Text("here", "green")
     if silent == float("inf"):
         return Text("starting", style="yellow")
     return Text(f"silent {silent:.0f} s", "yellow") if silent > QUIET_S else Text("here", "green")
@@ -76,7 +78,9 @@ def figures(state: RunState, service: Service, now: float) -> str:
             behind = state.staleness(service)
             stale = f" · {behind[0]} behind, {behind[1]:.0f} s old" if behind else ""
             busy = _percent(service, ("inference", "arena", "draw", "wait"))
-            return f"{thousands(service.per_second('robot_steps', now))} steps/s{stale} · {busy}"
+            slot = "no slot" if service.slot is None else f"slot {service.slot}"
+            rate = thousands(service.per_second("robot_steps", now))
+            return f"{slot} · {rate} steps/s{stale} · {busy}"
         case "replay":
             refused = int(m.get("refused", 0))
             lost = f"{int(m.get('gaps', 0))} gaps, {refused} refused"

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from common.config import Config
-from common.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
+from common.trajectory import NO_SLOT, EpisodeSummary, Evaluation, Outcome, Stats
 from services.dashboard.rates import Rate, Share, Spread, Spreading
 from services.dashboard.records import EvaluationRecord
 
-ROLES = ("actor", "replay", "learner", "evaluator")
+ROLES = ("actor", "replay", "learner", "evaluator", "status")
+WITHOUT_FIGURES = ("status",)  # roles that are only there
 # Counters of an actor start at 0 with it; those of the others are kept with the run.
 COUNTERS = {
     "actor": ("env_steps", "robot_steps"),
@@ -57,6 +58,12 @@ class Service:
         """Mean of one of its shares (0 ... 1) over the window."""
         share = self.shares.get(name)
         return share.mean if share else 0.0
+
+    @property
+    def slot(self) -> int | None:
+        """The slot of exploration that is leased to it; None for none, or when it has gone."""
+        slot = int(self.metrics.get("slot", NO_SLOT))
+        return slot if self.alive and slot != NO_SLOT else None
 
     def silent_s(self, now: float) -> float:
         """Seconds since its last stats; infinite before the first."""

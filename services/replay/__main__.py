@@ -2,14 +2,16 @@
 
 import logging
 import sys
+import time
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, ReplayConfig, load_config, to_toml
-from common.errors import ConfigError
+from common.errors import ConfigError, WireError
 from common.files import RUN_CONFIG
 from common.keys import Keys, check_name
 from common.process import (
@@ -19,7 +21,10 @@ from common.process import (
     noted_endpoint,
     run_main,
 )
-from common.transport import Session
+from common.trajectory import LeaseRequest
+from common.transport import Server, Session
+from common.wire import decode, encode
+from services.replay.leases import LeaseTable
 from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
 from services.replay.sampler import PrioritizedSampler, Sampler, UniformSampler
@@ -29,6 +34,7 @@ from services.replay.table import Table, bytes_per_transition
 
 _LOG = logging.getLogger("replay")
 _TICK_S = 0.2
+_LEASES_A_TICK = 1000
 
 
 def main(argv: Sequence[str]) -> int:
@@ -60,6 +66,7 @@ def main(argv: Sequence[str]) -> int:
     log = open_log(config, run_dir / "replay" / str(shard))
     with Session(transport) as session:
         configs = session.server(keys.config)
+        asked = session.server(keys.leases) if shard == 0 else None
         inserts, samples = session.server(keys.insert(shard)), session.server(keys.sample(shard))
         priorities = session.server(keys.priorities(shard))
         reporter = StatsReporter(session.publisher(keys.stats("replay", worker)), "replay", worker)
@@ -69,11 +76,15 @@ def main(argv: Sequence[str]) -> int:
         session.announce(keys.live("replay", worker))
         _LOG.info("serving %s, %d of %d transitions", arguments.run, len(table), table.capacity)
         shared = to_toml(config).encode()
+        exploration = config.exploration
+        leases = LeaseTable(exploration.lease_s, exploration.slots, time.monotonic())
         try:
             while not stop.is_set() and service.healthy:
                 request = configs.take(_TICK_S)
                 if request is not None:
                     request.reply(shared)
+                if asked is not None:
+                    lease_slots(asked, leases)
                 if service.accepting:
                     reporter.worked()
                 reporter.maybe(service.metrics)
@@ -82,6 +93,17 @@ def main(argv: Sequence[str]) -> int:
             if log is not None:
                 log.close()
     return 0 if stop.is_set() else 1
+
+
+def lease_slots(asked: Server, leases: LeaseTable) -> None:
+    """Answer actors that wait for a slot of exploration, so many at a time."""
+    for request in islice(iter(lambda: asked.take(0.0), None), _LEASES_A_TICK):
+        try:
+            wish = decode(LeaseRequest, request.payload)
+        except WireError as error:
+            request.refuse(str(error))
+            continue
+        request.reply(encode(leases.answer(wish, time.monotonic())))
 
 
 def config_of(run_dir: Path) -> str | None:

@@ -12,6 +12,7 @@ from common.arguments import Parser
 from common.heartbeat import Heartbeat
 from common.process import StopSignal, fetch_config, joining_of, joining_parser
 from common.transport import Session
+from common.versions import PACKAGES
 from services.dashboard.limiting import limiting_stage
 from services.dashboard.recorder import Recorder, flat_metrics
 from services.dashboard.screen import screen
@@ -21,6 +22,7 @@ from services.train.display import display
 from services.train.follower import Follower
 from services.train.rundir import RunDirectory
 
+VERSIONED = ("python", *PACKAGES)
 _TICK_S = 0.25
 _LISTEN_S = 3.0  # every service speaks once a second, and two words of it make a rate
 _JSON_PERIOD_S = 1.0
@@ -38,6 +40,7 @@ def main(argv: Sequence[str]) -> int:
         if arguments.record:
             run = owned.enter_context(RunDirectory.join(joining.run_dir, config))
             recorder = owned.enter_context(Recorder(run.path, config))
+            session.announce(joining.keys.live("status", joining.worker))
         state, rule = RunState(config), StoppingRule(config.run)
         follower = Follower(session, joining.keys, state, recorder, rule)
         if not (arguments.watch or arguments.record):
@@ -115,7 +118,14 @@ def status(state: RunState, now: float) -> dict[str, Any]:
     return {
         "limited_by": limiting_stage(state).replace("\N{NO-BREAK SPACE}", " "),
         "services": [
-            {"role": s.role, "id": s.id, "alive": s.alive, "silent_s": finite(s.silent_s(now))}
+            {
+                "role": s.role,
+                "id": s.id,
+                "alive": s.alive,
+                "silent_s": finite(s.silent_s(now)),
+                "slot": s.slot,
+                "versions": {name: s.text[name] for name in VERSIONED if name in s.text},
+            }
             for s in state.services
         ],
         "replay_size": state.replay_size,

@@ -47,6 +47,7 @@ def test_the_keys_of_a_run() -> None:
         keys.priorities(): "mrcdrl/run-1/replay/0/priorities",
         keys.priorities(2): "mrcdrl/run-1/replay/2/priorities",
         keys.config: "mrcdrl/run-1/config",
+        keys.leases: "mrcdrl/run-1/leases",
         keys.weights: "mrcdrl/run-1/weights",
         keys.evaluation("e"): "mrcdrl/run-1/evaluation/e",
         keys.every_evaluation: "mrcdrl/run-1/evaluation/*",
@@ -60,7 +61,7 @@ def test_the_keys_of_a_run() -> None:
     }
     for key, literal in expected.items():
         assert key == literal
-    assert len(expected) == 17
+    assert len(expected) == 18
 
 
 def test_role_and_worker_are_read_back_from_a_live_key() -> None:

@@ -20,6 +20,8 @@ from common.trajectory import (
     EpisodeSummary,
     Evaluation,
     InsertReply,
+    LeaseReply,
+    LeaseRequest,
     Outcome,
     Priorities,
     PrioritiesReply,
@@ -131,6 +133,21 @@ MESSAGES = st.one_of(
     st.builds(InsertReply, sequence=INTS, duplicate=st.booleans(), inserts=INTS),
     st.builds(SampleRequest, batch_size=INTS),
     st.builds(PrioritiesReply, updated=INTS, ignored=INTS),
+    st.builds(
+        LeaseRequest,
+        actor=NAMES,
+        incarnation=INTS,
+        slot=COUNTS,
+        holds=st.booleans(),
+        ends=st.booleans(),
+    ),
+    st.builds(
+        LeaseReply,
+        slot=COUNTS,
+        rank=st.integers(0, 9),
+        num_places=st.integers(10, 99),
+        lease_s=st.floats(0.1, 1e6),
+    ),
     st.builds(Weights.of, epoch=INTS, version=INTS, learner_step=INTS, payload=st.binary()),
     st.builds(
         Stats,
@@ -149,6 +166,8 @@ CLASSES = (
     SampleRequest,
     Priorities,
     PrioritiesReply,
+    LeaseRequest,
+    LeaseReply,
     Weights,
     Stats,
 )
@@ -215,6 +234,8 @@ SAMPLES = Samples(
     weights_versions=np.array([3, 3], np.int64),
 )
 PRIORITIES = Priorities(np.array([7, 9], np.int64), np.array([0.5, 0.0], np.float32))
+WISH = LeaseRequest("a", 1, 3, holds=True, ends=False)
+LEASE = LeaseReply(3, 2, 5, 15.0)
 STATS = Stats("actor", "actor-0", {"env_steps": 3.0})
 EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
 _DEEP = b"\x91" * 1000 + b"\x90"  # a list in a list in a list …, as deep as msgpack unpacks
@@ -332,6 +353,14 @@ MALFORMED = {
         changed(PRIORITIES, priorities=floats(1, np.inf)),
         "not finite",
     ),
+    "wish of a long name": (LeaseRequest, changed(WISH, actor="a" * 65), "64 characters"),
+    "wish for slot -2": (LeaseRequest, changed(WISH, slot=-2), "slot is below -1"),
+    "wish that holds none": (LeaseRequest, changed(WISH, slot=-1), "names none"),
+    "lease of slot -2": (LeaseReply, changed(LEASE, slot=-2), "slot is below -1"),
+    "rank above the places": (LeaseReply, changed(LEASE, rank=5), "none of 5 places"),
+    "negative rank": (LeaseReply, changed(LEASE, rank=-1), "none of 5 places"),
+    "lease of no time": (LeaseReply, changed(LEASE, lease_s=0.0), "not above 0"),
+    "lease for ever": (LeaseReply, changed(LEASE, lease_s=np.inf), "finite"),
     "NaN priority": (Priorities, changed(PRIORITIES, priorities=floats(np.nan, 1)), "not finite"),
 }
 

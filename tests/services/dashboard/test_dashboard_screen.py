@@ -80,6 +80,21 @@ def test_a_silent_service_is_shown_as_such() -> None:
     assert "silent 39 s" in "\n".join(rendered(busy_state(1), 80, 24, 50.0))
 
 
+def test_slots_and_who_has_gone_are_shown() -> None:
+    state = RunState(CONFIG)
+    for name, slot in (("actor-0", 0.0), ("actor-1", 7.0), ("actor-2", -1.0)):
+        state.observe_stats(Stats("actor", name, {"slot": slot}), 0.0)
+    state.observe_presence("status", "status-0", alive=True)
+    state.observe_presence("actor", "actor-1", alive=False)
+    lines = rendered(state, 100, 32, 1.0)
+    shown = {line.split()[0]: line for line in lines if line.startswith(("actor-", "status"))}
+    assert "slot 0 ·" in shown["actor-0"]
+    assert "no slot ·" in shown["actor-1"]
+    assert "no slot ·" in shown["actor-2"]
+    ends = {name: line.split()[-1] for name, line in shown.items()}
+    assert ends == {"actor-0": "here", "actor-1": "gone", "actor-2": "here", "status-0": "here"}
+
+
 def test_plain_line_is_one_line_of_the_same_figures() -> None:
     line = plain_line(busy_state(3), 11.2)
     assert "\n" not in line

@@ -31,10 +31,18 @@ def test_of_nobody() -> None:
 def test_of_a_service_that_fell_silent() -> None:
     state = RunState(Config())
     state.observe_presence("replay", "replay-0", True)
-    state.observe_stats(Stats("actor", "a", {"robot_steps": 10.0, "loss": float("nan")}, {}), 2.0)
+    metrics = {"robot_steps": 10.0, "loss": float("nan"), "slot": 3.0}
+    state.observe_stats(Stats("actor", "a", metrics, {"zenoh": "1.10.2", "clock_ns": "1"}), 2.0)
     actor, replay = status(state, 9.0)["services"]
-    assert actor == {"role": "actor", "id": "a", "alive": True, "silent_s": 7.0}
-    assert replay == {"role": "replay", "id": "replay-0", "alive": True, "silent_s": None}
+    assert actor == {
+        "role": "actor",
+        "id": "a",
+        "alive": True,
+        "silent_s": 7.0,
+        "slot": 3,
+        "versions": {"zenoh": "1.10.2"},
+    }
+    assert (replay["alive"], replay["silent_s"], replay["slot"]) == (True, None, None)
     json.dumps(status(state, 9.0), allow_nan=False)
 
 

@@ -1,0 +1,237 @@
+"""Slots of exploration: who gets which, and that two actors never hold one."""
+
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from common.trajectory import NO_SLOT, LeaseReply, LeaseRequest
+from services.actor.lease import WHOLE_LADDER, HeldLease
+from services.replay.leases import LeaseTable
+
+LEASE_S = 10.0
+ANSWER_S = 2.0
+
+
+def opened(num_places: int = 0) -> LeaseTable:
+    """A table whose first leases could all have been claimed again: it is later than 0."""
+    return LeaseTable(LEASE_S, num_places, -LEASE_S)
+
+
+def wish(
+    actor: str, incarnation: int = 1, slot: int = NO_SLOT, *, holds: bool = False
+) -> LeaseRequest:
+    return LeaseRequest(actor, incarnation, slot, holds, ends=False)
+
+
+def ends(actor: str, incarnation: int = 1) -> LeaseRequest:
+    return LeaseRequest(actor, incarnation, NO_SLOT, holds=False, ends=True)
+
+
+def test_the_lowest_free_slot_is_given_and_prolonged() -> None:
+    table = opened()
+    assert [table.answer(wish(name), 0).slot for name in "abc"] == [0, 1, 2]
+    assert table.answer(ends("b"), 1).slot == NO_SLOT
+    assert table.answer(wish("d"), 1).slot == 1
+    assert table.answer(wish("a"), 9).slot == 0
+    assert table.answer(wish("e"), 10).slot == 2, "c was not heard of for a lease"
+    assert table.answer(wish("c"), 10).slot == 3
+
+
+def test_the_place_on_the_ladder_is_the_rank_among_those_that_hold_a_slot() -> None:
+    table = opened()
+    replies = [table.answer(wish(name), 0) for name in "abc"]
+    assert (replies[2].rank, replies[2].num_places) == (2, 3)
+    table.answer(ends("b"), 1)
+    c = table.answer(wish("c", slot=2, holds=True), 1)
+    assert (c.slot, c.rank, c.num_places) == (2, 1, 2)
+
+
+def test_a_ladder_of_a_set_size_has_its_places_and_no_more() -> None:
+    table = opened(num_places=2)
+    assert table.answer(wish("a"), 0) == LeaseReply(0, 0, 2, LEASE_S)
+    assert table.answer(wish("b"), 0) == LeaseReply(1, 1, 2, LEASE_S)
+    assert table.answer(wish("c"), 0).slot == NO_SLOT
+    table.answer(ends("a"), 1)
+    assert table.answer(wish("c", slot=7), 1).slot == 0, "7 is no slot of this ladder"
+
+
+def test_an_actor_started_again_takes_a_free_slot_and_its_own_where_that_is_one() -> None:
+    table = opened()
+    for name in "abc":
+        table.answer(wish(name), 0)
+    table.answer(wish("c", slot=2, holds=True), 5)
+    assert table.answer(wish("a", incarnation=2), 6).slot == 3, "its earlier start may live yet"
+    assert table.answer(wish("b", incarnation=2), 11).slot == 1, "not 0, which is free as well"
+
+
+def test_a_lost_slot_is_not_taken_back() -> None:
+    table = opened()
+    table.answer(wish("a"), 0)
+    assert table.answer(wish("b"), 10).slot == 0
+    assert table.answer(wish("a", slot=0), 11).slot == 1
+
+
+def test_who_was_stopped_gives_back_nothing_of_another() -> None:
+    table = opened()
+    table.answer(wish("a"), 0)
+    table.answer(wish("b"), 10)
+    table.answer(ends("a"), 11)
+    assert table.answer(wish("c"), 11).slot == 1
+
+
+def test_after_a_start_holders_claim_their_slots_before_others_get_any() -> None:
+    table = LeaseTable(LEASE_S, 0, 100)
+    assert table.answer(wish("new"), 101).slot == NO_SLOT
+    assert table.answer(wish("was away too long", slot=1), 101).slot == NO_SLOT
+    assert table.answer(wish("a", slot=4, holds=True), 102).slot == 4
+    assert table.answer(wish("b", slot=4, holds=True), 102).slot == NO_SLOT
+    assert table.answer(wish("new"), 110).slot == 0
+
+
+def test_an_actor_loses_its_slot_by_its_own_clock() -> None:
+    lease = HeldLease("a", 1)
+    assert lease.place(0) == WHOLE_LADDER
+    lease.take(LeaseReply(3, 2, 5, LEASE_S), asked_s=100)
+    assert (lease.slot(108.9), lease.place(108.9)) == (3, (2, 5))
+    assert lease.request(106, ANSWER_S).holds
+    assert not lease.request(108, ANSWER_S).holds, "it may be over when the claim arrives"
+    assert (lease.slot(109), lease.place(109)) == (NO_SLOT, WHOLE_LADDER)
+    assert lease.request(109, ANSWER_S).slot == 3, "what it would have again"
+
+
+def test_an_answer_that_was_long_under_way_gives_nothing() -> None:
+    lease = HeldLease("a", 1)
+    lease.take(LeaseReply(3, 2, 5, LEASE_S), asked_s=0)
+    assert lease.slot(60) == NO_SLOT
+
+
+@dataclass
+class Asked:
+    """A request under way, or its answer."""
+
+    request: LeaseRequest
+    asked_s: float  # by the actor's clock
+    sent_s: float  # in truth
+    table: int  # that was there when it was sent
+    reply: LeaseReply | None = None
+
+
+@dataclass
+class Actor:
+    """A process; what it believes is what is judged."""
+
+    name: str
+    rate: float  # of its clock
+    lease: HeldLease
+    under_way: list[Asked] = field(default_factory=list)
+
+
+class LeasesAgainstTime(RuleBasedStateMachine):
+    """Actors ask, are stopped for any time, killed, started again; messages are late or lost,
+    replay starts again, and no two clocks run alike: nowhere two that believe to hold one slot."""
+
+    @initialize(num_places=st.sampled_from([0, 0, 2]), rate=st.floats(0.96, 1.04))
+    def begin(self, num_places: int, rate: float) -> None:
+        self.now_s = 0.0
+        self.num_places, self.rate = num_places, rate
+        self.started, self.tables = 2, 1
+        self.actors = [Actor("a", 1.0, HeldLease("a", 1)), Actor("b", 0.97, HeldLease("b", 2))]
+        self.table = opened(num_places)
+
+    @rule()
+    def start_replay(self) -> None:
+        self.tables += 1
+        self.table = LeaseTable(LEASE_S, self.num_places, self.rate * self.now_s)
+
+    @precondition(lambda self: len(self.actors) < 4)
+    @rule(name=st.sampled_from("abc"), rate=st.floats(0.96, 1.04))
+    def start_actor(self, name: str, rate: float) -> None:
+        self.started += 1
+        self.actors.append(Actor(name, rate, HeldLease(name, self.started)))
+
+    @precondition(lambda self: self.actors)
+    @rule(data=st.data())
+    def kill_actor(self, data: st.DataObject) -> None:
+        self.actors.remove(data.draw(st.sampled_from(self.actors)))
+
+    @precondition(lambda self: self.actors)
+    @rule(data=st.data(), end=st.booleans())
+    def ask(self, data: st.DataObject, end: bool) -> None:
+        actor = data.draw(st.sampled_from(self.actors))
+        clock = actor.rate * self.now_s
+        request = actor.lease.request(clock, ANSWER_S, ends=end)
+        actor.under_way.append(Asked(request, clock, self.now_s, self.tables))
+        if end:  # it works no more
+            self.actors.remove(actor)
+            self.arrive(actor.under_way[-1])
+
+    @precondition(lambda self: any(actor.under_way for actor in self.actors))
+    @rule(data=st.data(), lost=st.booleans())
+    def carry(self, data: st.DataObject, lost: bool) -> None:
+        """A message reaches the other end, or is lost."""
+        actor = data.draw(st.sampled_from([a for a in self.actors if a.under_way]))
+        asked = data.draw(st.sampled_from(actor.under_way))
+        if lost:
+            actor.under_way.remove(asked)
+        elif asked.reply is None:
+            self.arrive(asked)
+        else:
+            actor.under_way.remove(asked)
+            actor.lease.take(asked.reply, asked.asked_s)
+
+    @precondition(lambda self: self.actors)
+    @rule(data=st.data())
+    def ask_and_hear(self, data: st.DataObject) -> None:
+        actor = data.draw(st.sampled_from(self.actors))
+        self.renew(actor)
+
+    @rule(seconds=st.sampled_from([0.1, 1.0, 3.0, 8.9, 9.1, 10.0, 11.0, 40.0]))
+    def wait(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def arrive(self, asked: Asked) -> None:
+        """At replay; one that asked an earlier process of it, only while the question stands."""
+        if asked.table == self.tables or self.now_s - asked.sent_s < 0.9 * ANSWER_S:
+            asked.reply = self.table.answer(asked.request, self.rate * self.now_s)
+
+    def renew(self, actor: Actor) -> None:
+        clock = actor.rate * self.now_s
+        request = actor.lease.request(clock, ANSWER_S)
+        actor.lease.take(self.table.answer(request, self.rate * self.now_s), clock)
+
+    @invariant()
+    def no_two_hold_one(self) -> None:
+        self.table.check_invariants()
+        slots = [actor.lease.slot(actor.rate * self.now_s) for actor in self.actors]
+        held = [slot for slot in slots if slot != NO_SLOT]
+        assert len(held) == len(set(held)), slots
+
+    def teardown(self) -> None:
+        """Whatever was: when all ask again and again, each has a place of its own."""
+        for _ in range(8):
+            self.now_s += LEASE_S / 3
+            for actor in self.actors:
+                self.renew(actor)
+        for actor in self.actors:
+            self.renew(actor)
+        places = [actor.lease.place(actor.rate * self.now_s) for actor in self.actors]
+        if not self.num_places:
+            assert sorted(places) == [(rank, len(places)) for rank in range(len(places))]
+        holders = sum(actor.lease.slot(actor.rate * self.now_s) >= 0 for actor in self.actors)
+        assert holders == min(len(self.actors), self.num_places or len(self.actors))
+
+
+TestLeasesAgainstTime = LeasesAgainstTime.TestCase
+TestLeasesAgainstTime.settings = settings(max_examples=150, stateful_step_count=40)
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_who_holds_what_is_shown(count: int) -> None:
+    table = opened()
+    for number in range(count):
+        table.answer(wish(f"actor-{number}"), 0)
+    assert len(table) == count
+    assert f"{count - 1}: ('actor-{count - 1}', 1)" in repr(table)
