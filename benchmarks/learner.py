@@ -33,10 +33,10 @@ from benchmarks.machine import emit, seconds_per_call, spread
 from benchmarks.replay_peers import run
 from common.config import AgentConfig, LearnerConfig
 from common.network import Precision
+from common.process import ALLOCATOR
 from services.dashboard.records import METRICS
 from services.learner.batch import Batch
 from services.learner.learner import Learner
-from services.train.fleet import ALLOCATOR
 
 _BATCHES = 8  # in turns, as the harness does
 _MATRIX = 1024  # side of the matrices whose product is taken for the peak

@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.machine import emit
-from services.train.fleet import ALLOCATOR
+from common.process import ALLOCATOR
 
 HARNESS = "peers_harness"  # its own name, `common`, is that of a package of ours
 LINKED = "MRCDRL_BENCH_HARNESS"

@@ -32,6 +32,13 @@ from common.wire import encode
 
 ENDPOINT_FILE = "endpoint"
 DIE_WITH_PARENT = "MRCDRL_DIE_WITH_PARENT"  # its process id, set by who starts services
+# Of the environment of processes that learn: freed memory stays with them. Else each large tensor
+# is mapped afresh at every step.
+ALLOCATOR = {
+    "MALLOC_MMAP_MAX_": "0",
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
+    "MALLOC_TOP_PAD_": str(64 << 20),
+}
 STOP_DEADLINE_S = 30  # of a service, from the signal to its end
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"

@@ -16,6 +16,7 @@ _COMMANDS = {
     "replay": ("services.replay.__main__", "serve the replay table of a run"),
     "replay inspect": ("services.replay.inspect", "what the replay log of a run holds"),
     "status": ("services.train.status", "what a run that is up does, and what limits it"),
+    "doctor": ("services.doctor.__main__", "what this machine and a run lack, and how to mend it"),
     "router": ("services.router.__main__", "relay between the processes of runs"),
     "certs": ("services.router.certs", "certificates for trials, one for each role"),
     "actor": ("services.actor.__main__", "collect for a run that is up"),

@@ -45,6 +45,7 @@ PLACES = {
     "rich": (
         "services/dashboard",
         "services/train",
+        "services/doctor/__main__.py",
         "services/evaluator",
         "services/replay/inspect.py",
     ),
@@ -156,6 +157,7 @@ HEAVY = {"torch", "cv2", "numba", "pymunk", "matplotlib", "av", "safetensors", "
         ("services.train.__main__", {"torch", "safetensors"}),
         ("services.train.status", HEAVY - {"rich"}),
         ("services.actor.simulate.__main__", HEAVY),
+        ("services.doctor.__main__", HEAVY - {"rich"}),
         ("common.heartbeat", {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}),
     ],
 )

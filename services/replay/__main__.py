@@ -11,7 +11,7 @@ import numpy as np
 
 from common.arguments import Parser, add_config_flags, overrides
 from common.config import Config, ReplayConfig, load_config, to_toml
-from common.errors import ConfigError, WireError
+from common.errors import WireError
 from common.files import RUN_CONFIG
 from common.keys import Keys, check_name
 from common.process import (
@@ -29,8 +29,8 @@ from services.replay.limiter import RateLimiter
 from services.replay.log import SegmentLog
 from services.replay.sampler import PrioritizedSampler, Sampler, UniformSampler
 from services.replay.service import ReplayService
-from services.replay.sum_tree import MAX_NODES, NODE_BYTES
-from services.replay.table import Table, bytes_per_transition
+from services.replay.size import capacity_of
+from services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
 _TICK_S = 0.2
@@ -148,23 +148,6 @@ def build(config: Config, *, record_bytes: int | None = None) -> tuple[Table, Ra
         largest_sample=config.learner.sample_size,
     )
     return table, limiter
-
-
-def capacity_of(config: Config) -> int:
-    """Transitions of one shard: as configured, or what replay.capacity_bytes allow."""
-    replay = config.replay
-    if not replay.capacity_bytes:
-        return replay.shard_capacity
-    window = config.arena.stack + config.agent.n_step
-    each = bytes_per_transition(window, config.actor.chunk_length, config.arena.record_bytes)
-    each += MAX_NODES * NODE_BYTES * replay.prioritized
-    room = int(replay.capacity_bytes / replay.shards / each)
-    if room < replay.shard_min_size:
-        raise ConfigError(
-            f"replay.capacity_bytes {replay.capacity_bytes} holds {room * replay.shards} "
-            f"transitions of {each:.0f} bytes, fewer than replay.min_size {replay.min_size}"
-        )
-    return min(replay.shard_capacity, room)
 
 
 def make_sampler(replay: ReplayConfig, capacity: int) -> Sampler:

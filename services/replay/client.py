@@ -1,4 +1,4 @@
-"""What an actor and a learner use of replay."""
+"""What others use of replay: actors, the learner, and who looks after them."""
 
 import dataclasses
 import logging
@@ -16,8 +16,16 @@ from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, S
 from common.transport import Client, PendingReply, Session
 from common.wire import SampleRequest, decode, encode, encode_parts
 from services.replay.shards import ShardStream, shard_of, shares
+from services.replay.size import table_bytes
 
-__all__ = ["PriorityWriter", "ReplayReader", "ReplayWriter", "shard_of", "split_samples"]
+__all__ = [
+    "PriorityWriter",
+    "ReplayReader",
+    "ReplayWriter",
+    "shard_of",
+    "split_samples",
+    "table_bytes",
+]
 
 _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2

@@ -16,15 +16,9 @@ from pathlib import Path
 
 from common.config import ENV_PREFIX
 from common.errors import DivergedError, MrcdrlError
-from common.process import DIE_WITH_PARENT
+from common.process import ALLOCATOR, DIE_WITH_PARENT
 
 _LOG = logging.getLogger("train")
-# Freed memory stays with the process: else each large tensor is mapped afresh at every step.
-ALLOCATOR = {
-    "MALLOC_MMAP_MAX_": "0",
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
-    "MALLOC_TOP_PAD_": str(64 << 20),
-}
 _TERM_S = 20.0  # until a service that was asked to stop is killed
 _MIN_LIFE_S = 10.0  # a service that fails sooner would fail again
 _LONG_LIFE_S = 300.0  # one that lived so long may be started again as often as at first

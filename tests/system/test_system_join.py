@@ -13,7 +13,7 @@ import pytest
 from common.config import TransportConfig
 from common.keys import Keys, role_and_worker
 from common.process import ENDPOINT_FILE, StopSignal
-from common.trajectory import Evaluation, Stats
+from common.trajectory import NO_SLOT, Evaluation, Stats
 from common.transport import Presence, QueueSubscriber, Session
 from common.weights import WeightsReader
 from common.wire import decode
@@ -73,6 +73,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     folder, name = tmp_path_factory.mktemp("live"), run_name("live")
     arguments = ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
     more = ["--run.evaluators", "0", "--learner-steps", "100000000"]
+    more += ["--exploration.lease_s", "3"]
     note = folder / name / ENDPOINT_FILE
     try:
         with Command([*arguments, *more], folder) as train:
@@ -108,6 +109,7 @@ def test_an_actor_joins_leaves_and_joins_again_by_hand(live: Live) -> None:
         with Command(["actor", *live.join, "--id", worker], live.folder) as actor:
             eventually(lambda worker=worker: live.is_there("actor", worker), f"{worker} joins")
             live.hear(worker, "inserts_acknowledged", 0)
+            live.hear(worker, "slot", NO_SLOT)
             assert live.is_there("actor", "actor-0")
             actor.signal(signal.SIGTERM)
             assert actor.wait() == 0, actor.err
