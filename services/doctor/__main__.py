@@ -25,7 +25,8 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red"}
 def main(argv: Sequence[str]) -> int:
     """Check and show; 1 where something failed."""
     arguments = parser().parse_args(argv)
-    config, found = None, list[Finding]()
+    config: Config | None = None
+    found: list[Finding] = []
     if arguments.run:
         found, config = look_at_run(arguments)
     own = config or load_config(arguments.config, overrides(arguments))
@@ -57,7 +58,7 @@ def look_at_run(arguments: argparse.Namespace) -> tuple[list[Finding], Config | 
         joining = joining_of(arguments)
     except EndpointError as error:
         return [failed("endpoint", str(error), "start the run, or give --connect")], None
-    return look(joining, StopSignal().listen())
+    return look(joining, StopSignal())
 
 
 def show(found: Iterable[Finding], console: Console) -> None:
