@@ -2,7 +2,6 @@
 
 import resource
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
@@ -124,17 +123,13 @@ def test_memory_can_be_lent() -> None:
     assert "memlock" in found.said
 
 
-@pytest.fixture
-def no_descriptors() -> Iterator[None]:
-    """This process may open no file more."""
+def test_no_memory_to_lend() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-def test_no_memory_to_lend(no_descriptors: None) -> None:
-    found = shared_memory()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))  # no file more may be opened
+    try:
+        found = shared_memory()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert (found.verdict, bool(found.mend)) == ("warning", True)
 
 
