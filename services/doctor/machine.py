@@ -167,8 +167,8 @@ def shared_memory() -> Finding:
         command = [sys.executable, "-I", "-S", "-c", _OPENER, path]
         opened = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         if opened.returncode:
-            said = opened.stderr.strip().splitlines()
-            raise SlotError(said[-1] if said else f"it ended with {opened.returncode}")
+            lines = opened.stderr.strip().splitlines()
+            raise SlotError(lines[-1] if lines else f"it ended with {opened.returncode}")
     except (OSError, SlotError, subprocess.TimeoutExpired) as error:
         return warning(check, f"no process can open what another lends: {error}", mend)
     said = "a process can open what another lends"
