@@ -103,7 +103,7 @@ class Actor:
     def run(self, stop: StopSignal) -> None:
         """Follow, step, send, tell, until stopped."""
         self._adopt(self._reader.wait(stop, meanwhile=self._report))
-        self._epsilons = self._explore()
+        self._epsilons = self._explore(self._lease.place)
         while not stop.is_set():
             self._follow()
             self._tell(*self._collector.step(self._epsilons), stop)
