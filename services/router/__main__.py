@@ -25,7 +25,9 @@ def main(argv: Sequence[str]) -> int:
         action="append",
         help="endpoint, such as tcp/0.0.0.0:7447; by default the file's",
     )
-    parser.add_argument("--connect", action="append", help="another router's endpoint, to link to")
+    parser.add_argument(
+        "--connect", action="append", help="another router's endpoint, to link to when it is there"
+    )
     add_config_flags(parser, only=("transport",))
     arguments = parser.parse_args(argv)
     given = load_transport(overrides(arguments))

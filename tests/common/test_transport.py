@@ -409,6 +409,23 @@ def test_a_free_endpoint_is_free() -> None:
         assert "open" in repr(session)
 
 
+def test_a_router_is_of_use_before_the_one_it_links_to_and_links_again_to_each_that_comes() -> None:
+    near, far = free_endpoint(), free_endpoint()
+    with (
+        Session(TransportConfig(listen=(near,), connect=(far,))),
+        Session(TransportConfig(connect=(near,))) as serving,
+        Session(TransportConfig(connect=(near,))) as neighbour,
+    ):
+        server = serving.server(KEY)
+        until_served(neighbour, KEY, server)
+        for _ in range(2):
+            with (
+                Session(TransportConfig(listen=(far,))),
+                Session(TransportConfig(connect=(far,))) as distant,
+            ):
+                until_served(distant, KEY, server)
+
+
 @pytest.mark.parametrize("endpoint", ["tcp", "127.0.0.1:7447", "tcp/", ""])
 def test_a_malformed_endpoint_is_refused_at_once(endpoint: str) -> None:
     with pytest.raises(EndpointError, match="is no endpoint"):
