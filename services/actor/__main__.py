@@ -136,16 +136,17 @@ class Actor:
         self, chunks: Sequence[Chunk], episodes: Sequence[EpisodeSummary], stop: StopSignal
     ) -> None:
         """Spool the chunks, publish the episodes."""
-        for chunk in chunks:
-            waiting_s = time.monotonic()
-            while not self._sender.put(chunk, timeout_s=0.2) and not stop.is_set():
-                self._lease.follow()
-                self._reporter.worked(self._sender.heard_s)
-                self._reporter.maybe(self._metrics)
-            self._waited_s += time.monotonic() - waiting_s
+        began_s = time.monotonic()
+        self._sender.put_all(chunks, stop, self._report_waiting)
+        self._waited_s += time.monotonic() - began_s
         for episode in episodes:
             self._episodes.put(encode(episode))
         self._report()
+
+    def _report_waiting(self) -> None:
+        self._lease.follow()
+        self._reporter.worked(self._sender.heard_s)
+        self._reporter.maybe(self._metrics)
 
     def _report(self) -> None:
         self._lease.follow()

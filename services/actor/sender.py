@@ -7,7 +7,9 @@ wait, which is how replay's rate limiter holds the arenas back.
 import contextlib
 import queue
 import threading
+from collections.abc import Callable, Sequence
 
+from common.process import StopSignal
 from common.trajectory import Chunk
 from services.replay.client import ReplayWriter
 
@@ -53,6 +55,19 @@ class Sender:
         """Raise the error that ended the sending, if one did."""
         if self._error is not None:
             raise self._error
+
+    def put_all(
+        self, chunks: Sequence[Chunk], stop: StopSignal, meanwhile: Callable[[], None]
+    ) -> None:
+        """Spool them in order; when stopped, none after the first for which there is no room.
+
+        meanwhile: called several times a second while there is none.
+        """
+        for chunk in chunks:
+            while not self.put(chunk, _POLL_S):
+                if stop.is_set():
+                    return
+                meanwhile()
 
     def close(self) -> None:
         """Send what is spooled if replay takes it at once, then end the thread."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from common.errors import RefusedError
+from common.process import StopSignal
 from common.trajectory import Chunk, InsertReply
 from services.actor.sender import Sender
 
@@ -90,6 +91,34 @@ def test_a_full_spool_makes_put_wait_and_drops_nothing() -> None:
         assert sender.put(chunk(3), _DEADLINE_S)
     assert [writer.next() for _ in range(2)] == [2, 3]
     assert sender.chunks == 4
+
+
+def test_once_stopped_no_chunk_is_spooled_after_one_that_had_no_room() -> None:
+    """It would look like one that was lost."""
+    writer, stop = FakeWriter(prompt=False), StopSignal()
+    with sending(writer, spool_chunks=1) as sender:
+        sender.put_all([chunk(0)], stop, lambda: None)
+        assert writer.next() == 0  # taken out of the spool, not acknowledged
+        tried: list[int] = []
+
+        def put_the_second(spooled: Chunk, timeout_s: float) -> bool:
+            tried.append(spooled.sequence)
+            return len(tried) > 1
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sender, "put", put_the_second)
+            stop.set()
+            sender.put_all([chunk(1), chunk(2)], stop, lambda: None)
+    assert tried == [1]
+    assert sender.chunks == 1
+
+
+def test_a_full_spool_is_waited_for() -> None:
+    writer = FakeWriter(prompt=False)
+    with sending(writer, spool_chunks=1) as sender:
+        chunks = [chunk(sequence) for sequence in range(4)]
+        sender.put_all(chunks, StopSignal(), writer.go_on.release)
+    assert [writer.next() for _ in range(4)] == list(range(4))
 
 
 def test_all_that_waits_leaves_at_once() -> None:
