@@ -32,6 +32,7 @@ def test_actors_and_incarnations_have_streams_of_their_own() -> None:
     book = SequenceBook()
     book.record("actor-0", 1, 4)
     assert book.classify("actor-0", 2, 0) is Arrival.NEXT
+    assert book.classify("actor-0", 0, 0) is Arrival.NEXT  # its clock was put back meanwhile
     assert book.classify("actor-1", 1, 0) is Arrival.NEXT
 
 

@@ -1,0 +1,98 @@
+"""Faults, each for as long as a `with` block lasts.
+
+What Linux lets one do to a process, a host's network and a file system; `tc netem` is in few
+kernels, so that packets are dropped by iptables and links slowed by a token bucket. A wall clock
+is the machine's and cannot be another for one process: `CLOCK_SHIFT` moves what Python reads of it.
+"""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.chaos.chaos_hosts import SLOW_QUEUE, Host, owned_name, owners_are_gone, run
+
+_CLOCK = Path(__file__).with_name("clock")  # its sitecustomize.py is what Python imports first
+CLOCK_SHIFT = "CHAOS_CLOCK_SHIFT_S"
+
+
+@contextmanager
+def stopped(pid: int) -> Iterator[None]:
+    """SIGSTOP, then SIGCONT: there, and silent."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+@contextmanager
+def cut_off(host: Host) -> Iterator[None]:
+    """All of a host's cables out: packets are lost, connections are not told."""
+    host.plug("down")
+    try:
+        yield
+    finally:
+        host.plug("up")
+
+
+@contextmanager
+def lossy(host: Host, share: float) -> Iterator[None]:
+    """This share of a host's packets is lost, of those that come and of those that go."""
+    rule = ("-m", "statistic", "--mode", "random", "--probability", str(share), "-j", "DROP")
+    for way in ("INPUT", "OUTPUT"):
+        host.run("iptables", "--append", way, *rule)
+    try:
+        yield
+    finally:
+        for way in ("INPUT", "OUTPUT"):
+            host.run("iptables", "--flush", way)
+
+
+@contextmanager
+def slow(host: Host, kilobits_per_s: int) -> Iterator[None]:
+    """A host's links carry no more than this, each way."""
+    ends = [(host.namespace, port) for port in host.ports]
+    ends += [(network.namespace, host.name) for network in host.networks]
+    for namespace, port in ends:
+        queue = ("root", *SLOW_QUEUE, f"{kilobits_per_s}kbit")
+        run("tc", "-n", namespace, "qdisc", "add", "dev", port, *queue)
+    try:
+        yield
+    finally:
+        for namespace, port in ends:
+            run("tc", "-n", namespace, "qdisc", "delete", "dev", port, "root")
+
+
+@contextmanager
+def disk(folder: Path, num_bytes: int) -> Iterator[None]:
+    """A file system of so many bytes on a folder, for `full` to fill."""
+    mounted = [line.split()[:2] for line in Path("/proc/mounts").read_text("utf-8").splitlines()]
+    left = owners_are_gone(source for source, _ in mounted)
+    for place in (place for source, place in mounted if source in left):
+        run("umount", "--lazy", place)
+    name = owned_name(folder.name)
+    run("mount", "-t", "tmpfs", "-o", f"size={num_bytes}", name, str(folder))
+    try:
+        yield
+    finally:
+        run("umount", "--lazy", str(folder))
+
+
+@contextmanager
+def full(folder: Path) -> Iterator[None]:
+    """No room on a `disk`: it becomes as small as what it holds."""
+    before = os.statvfs(folder)
+    used = (before.f_blocks - before.f_bfree) * before.f_frsize
+    run("mount", "-o", f"remount,size={max(used, before.f_frsize)}", str(folder))
+    try:
+        yield
+    finally:
+        run("mount", "-o", f"remount,size={before.f_blocks * before.f_frsize}", str(folder))
+
+
+def shifted_clock(seconds: float) -> dict[str, str]:
+    """Variables of a process whose wall clock is to be so far ahead."""
+    path = os.pathsep.join(filter(None, (str(_CLOCK), os.environ.get("PYTHONPATH"))))
+    return {"PYTHONPATH": path, CLOCK_SHIFT: str(seconds)}

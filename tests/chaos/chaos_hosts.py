@@ -1,0 +1,140 @@
+"""Hosts of our own on this machine: network namespaces, joined by networks that touch nothing else.
+
+A network is a bridge in a namespace, a host a namespace with a cable to each of its networks.
+Packets are not forwarded between networks: what crosses them is relayed by routers of a run.
+
+Invariants: every namespace bears this process's id in its name, and all of them are gone when the
+block ends, or when the next one begins after a process that was killed; nothing is made or changed
+in the namespace of this process. Needs root, and `ip`.
+"""
+
+import os
+import re
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+PORT = "eth"  # eth0 leads to a host's first network
+
+
+def run(*command: str) -> str:
+    """Its output; raises OSError with all that the command said."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    if done.returncode:
+        raise OSError(f"{' '.join(command)}: {done.stderr.strip() or done.stdout.strip()}")
+    return done.stdout
+
+
+def owned_name(name: str) -> str:
+    """A name that tells whose it is."""
+    return f"mrcdrl-{os.getpid()}-{name}"
+
+
+def owners_are_gone(names: Iterator[str]) -> list[str]:
+    """Those of our names whose processes were killed before they could remove what bears them."""
+    owners = {name: re.fullmatch(r"mrcdrl-(\d+)-.*", name) for name in names}
+    return [n for n, owner in owners.items() if owner and not Path("/proc", owner[1]).exists()]
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """One switch; `number` tells its addresses from other networks'."""
+
+    name: str
+    namespace: str
+    number: int
+    hosts: list["Host"] = field(default_factory=list, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """One machine, as far as the network is concerned."""
+
+    name: str
+    namespace: str
+    networks: tuple[Network, ...]
+
+    @property
+    def prefix(self) -> tuple[str, ...]:
+        """Of a command that is to run there; the process it starts becomes that command's."""
+        return ("ip", "netns", "exec", self.namespace)
+
+    @property
+    def ports(self) -> list[str]:
+        return [f"{PORT}{index}" for index in range(len(self.networks))]
+
+    def run(self, *command: str) -> None:
+        run(*self.prefix, *command)
+
+    def address(self, network: Network) -> str:
+        """Its IPv4 address in a network that it is in."""
+        return f"10.77.{network.number}.{network.hosts.index(self) + 1}"
+
+    def plug(self, state: str) -> None:
+        """Cables "up" or "down", at the switch: the host itself sees that its carrier is gone."""
+        for network in self.networks:
+            run("ip", "-n", network.namespace, "link", "set", "dev", self.name, state)
+
+
+class Hosts:
+    """Makes networks and hosts for as long as the block of `hosts` lasts."""
+
+    def __init__(self, owned: ExitStack) -> None:
+        self._owned = owned
+        self._num_networks = 0
+
+    def network(self, name: str) -> Network:
+        namespace = self._namespace(name)
+        run("ip", "-n", namespace, "link", "add", "switch", "type", "bridge")
+        run("ip", "-n", namespace, "link", "set", "dev", "switch", "up")
+        self._num_networks += 1
+        return Network(name, namespace, self._num_networks)
+
+    def host(self, name: str, *networks: Network) -> Host:
+        """name: at most 15 characters, which is what Linux has for an interface."""
+        host = Host(name, self._namespace(name), networks)
+        run("ip", "-n", host.namespace, "link", "set", "dev", "lo", "up")
+        for port, network in zip(host.ports, networks, strict=True):
+            network.hosts.append(host)
+            cable = ("link", "add", "name", name, "type", "veth", "peer", "name", port)
+            run("ip", "-n", network.namespace, *cable, "netns", host.namespace)
+            run("ip", "-n", network.namespace, "link", "set", "dev", name, "master", "switch", "up")
+            address = f"{host.address(network)}/24"
+            run("ip", "-n", host.namespace, "address", "add", address, "dev", port)
+            run("ip", "-n", host.namespace, "link", "set", "dev", port, "up")
+        return host
+
+    def _namespace(self, name: str) -> str:
+        namespace = owned_name(name)
+        run("ip", "netns", "add", namespace)
+        self._owned.callback(run, "ip", "netns", "delete", namespace)
+        return namespace
+
+
+@contextmanager
+def hosts() -> Iterator[Hosts]:
+    """Raises OSError where this machine does not let us have any."""
+    listed = run("ip", "netns", "list").splitlines()
+    for namespace in owners_are_gone(line.split()[0] for line in listed):
+        run("ip", "netns", "delete", namespace)
+    with ExitStack() as owned:
+        yield Hosts(owned)
+
+
+def why_no_hosts() -> str | None:
+    """What is missing for hosts and the faults of their networks, in words; None: nothing."""
+    if os.geteuid() != 0:
+        return "it takes root"
+    try:
+        with hosts() as made:
+            host = made.host("probe", made.network("probes"))
+            host.run("iptables", "--list")
+            host.run("tc", "qdisc", "add", "dev", "lo", "root", *SLOW_QUEUE, "1mbit")
+    except OSError as error:
+        return str(error)
+    return None
+
+
+SLOW_QUEUE = ("tbf", "burst", "16kb", "latency", "1s", "rate")
