@@ -84,12 +84,23 @@ def disk(folder: Path, num_bytes: int) -> Iterator[None]:
 def full(folder: Path) -> Iterator[None]:
     """No room on a `disk`: it becomes as small as what it holds."""
     before = os.statvfs(folder)
-    used = (before.f_blocks - before.f_bfree) * before.f_frsize
-    run("mount", "-o", f"remount,size={max(used, before.f_frsize)}", str(folder))
+    _shrink(folder)
     try:
         yield
     finally:
         run("mount", "-o", f"remount,size={before.f_blocks * before.f_frsize}", str(folder))
+
+
+def _shrink(folder: Path, attempts: int = 20) -> None:
+    """Where somebody writes meanwhile, it may already hold more than it is to hold."""
+    now = os.statvfs(folder)
+    used = max(now.f_blocks - now.f_bfree, 1) * now.f_frsize
+    try:
+        run("mount", "-o", f"remount,size={used}", str(folder))
+    except OSError:
+        if attempts == 1:
+            raise
+        _shrink(folder, attempts - 1)
 
 
 def shifted_clock(seconds: float) -> dict[str, str]:

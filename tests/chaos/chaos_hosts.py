@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 PORT = "eth"  # eth0 leads to a host's first network
+SLOW_QUEUE = ("tbf", "burst", "16kb", "latency", "1s", "rate")
 
 
 def run(*command: str) -> str:
@@ -126,15 +127,12 @@ def hosts() -> Iterator[Hosts]:
 def why_no_hosts() -> str | None:
     """What is missing for hosts and the faults of their networks, in words; None: nothing."""
     if os.geteuid() != 0:
-        return "it takes root"
+        return "they take root"
     try:
         with hosts() as made:
             host = made.host("probe", made.network("probes"))
             host.run("iptables", "--list")
             host.run("tc", "qdisc", "add", "dev", "lo", "root", *SLOW_QUEUE, "1mbit")
     except OSError as error:
-        return str(error)
+        return f"they take iproute2 and iptables, and a kernel that lets us: {error}"
     return None
-
-
-SLOW_QUEUE = ("tbf", "burst", "16kb", "latency", "1s", "rate")
