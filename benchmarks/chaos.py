@@ -27,8 +27,15 @@ from typing import Any
 
 from benchmarks.machine import emit, spread
 from common.config import load_config
-from tests.chaos.chaos_faults import cut_off, full, lossy, shifted_clock, slow, stopped
-from tests.chaos.chaos_hosts import why_no_hosts
+from tests.chaos.chaos_faults import (
+    cut_off,
+    full,
+    lossy,
+    shifted_clock,
+    slow,
+    stopped,
+    why_no_hosts,
+)
 from tests.chaos.chaos_observer import Observer, judge, watch
 from tests.chaos.chaos_stack import ON_DISKS, Service, stack
 
@@ -119,6 +126,7 @@ def main() -> int:
             if not arguments.kinds or fault.kind in arguments.kinds:
                 yield fault
 
+    print(f"seed {arguments.seed}", file=sys.stderr)
     with tempfile.TemporaryDirectory() as folder:
         result = ordeal(Path(folder), arguments.actors, chosen)
     settings = {name: vars(arguments)[name] for name in ("minutes", "seed", "actors")}

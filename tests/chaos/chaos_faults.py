@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.chaos.chaos_hosts import SLOW_QUEUE, Host, owned_name, owners_are_gone, run
+from tests.chaos.chaos_hosts import Host, hosts, owned_name, owners_are_gone, run
 
 _CLOCK = Path(__file__).with_name("clock")  # its sitecustomize.py is what Python imports first
 CLOCK_SHIFT = "CHAOS_CLOCK_SHIFT_S"
@@ -56,13 +56,26 @@ def slow(host: Host, kilobits_per_s: int) -> Iterator[None]:
     ends = [(host.namespace, port) for port in host.ports]
     ends += [(network.namespace, host.name) for network in host.networks]
     for namespace, port in ends:
-        queue = ("root", *SLOW_QUEUE, f"{kilobits_per_s}kbit")
-        run("tc", "-n", namespace, "qdisc", "add", "dev", port, *queue)
+        bucket = ("tbf", "rate", f"{kilobits_per_s}kbit", "burst", "16kb", "latency", "1s")
+        run("tc", "-n", namespace, "qdisc", "add", "dev", port, "root", *bucket)
     try:
         yield
     finally:
         for namespace, port in ends:
             run("tc", "-n", namespace, "qdisc", "delete", "dev", port, "root")
+
+
+def why_no_hosts() -> str | None:
+    """What is missing for hosts and the faults of their networks, in words; None: nothing."""
+    if os.geteuid() != 0:
+        return "they take root"
+    try:
+        with hosts() as made:
+            host = made.host("probe", made.network("probes"))
+            with cut_off(host), lossy(host, 0.5), slow(host, 1000):
+                return None
+    except OSError as error:
+        return f"they take iproute2 and iptables, and a kernel that has what these do: {error}"
 
 
 @contextmanager

@@ -4,7 +4,7 @@ A network is a bridge in a namespace, a host a namespace with a cable to each of
 Packets are not forwarded between networks: what crosses them is relayed by routers of a run.
 
 Invariants: every namespace bears this process's id in its name, and all of them are gone when the
-block ends, or when the next one begins after a process that was killed; nothing is made or changed
+block ends, or when the next begins after a process that was killed; nothing is made or changed
 in the namespace of this process. Needs root, and `ip`.
 """
 
@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 PORT = "eth"  # eth0 leads to a host's first network
-SLOW_QUEUE = ("tbf", "burst", "16kb", "latency", "1s", "rate")
 
 
 def run(*command: str) -> str:
@@ -122,17 +121,3 @@ def hosts() -> Iterator[Hosts]:
         run("ip", "netns", "delete", namespace)
     with ExitStack() as owned:
         yield Hosts(owned)
-
-
-def why_no_hosts() -> str | None:
-    """What is missing for hosts and the faults of their networks, in words; None: nothing."""
-    if os.geteuid() != 0:
-        return "they take root"
-    try:
-        with hosts() as made:
-            host = made.host("probe", made.network("probes"))
-            host.run("iptables", "--list")
-            host.run("tc", "qdisc", "add", "dev", "lo", "root", *SLOW_QUEUE, "1mbit")
-    except OSError as error:
-        return f"they take iproute2 and iptables, and a kernel that lets us: {error}"
-    return None

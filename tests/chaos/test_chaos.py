@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.chaos import KINDS, Fault, ordeal
-from tests.chaos.chaos_hosts import why_no_hosts
+from tests.chaos.chaos_faults import why_no_hosts
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 

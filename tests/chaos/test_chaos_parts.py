@@ -16,8 +16,17 @@ from common.config import load_config
 from common.trajectory import Stats, Weights
 from common.wire import encode
 from services.replay.contents import Contents
-from tests.chaos.chaos_faults import cut_off, disk, full, lossy, shifted_clock, slow, stopped
-from tests.chaos.chaos_hosts import Host, hosts, owned_name, run, why_no_hosts
+from tests.chaos.chaos_faults import (
+    cut_off,
+    disk,
+    full,
+    lossy,
+    shifted_clock,
+    slow,
+    stopped,
+    why_no_hosts,
+)
+from tests.chaos.chaos_hosts import Host, hosts, owned_name, run
 from tests.chaos.chaos_observer import Life, Observer, compare
 from tests.system.system_processes import REPOSITORY, environment, eventually
 
