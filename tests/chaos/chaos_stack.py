@@ -11,6 +11,7 @@ end with this process, whatever happens to it.
 
 import os
 import signal
+import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from pathlib import Path
 
 from common.config import Config, to_toml
 from common.heartbeat import FILE_VARIABLE, Pulse
-from common.process import DIE_WITH_PARENT
+from common.process import DIE_WITH_PARENT, STOP_DEADLINE_S
 from tests.chaos.chaos_faults import disk
 from tests.chaos.chaos_hosts import Host, Network, hosts
 from tests.system.system_processes import Command, run_name
@@ -106,10 +107,14 @@ class Stack:
 
     def end(self) -> dict[str, int]:
         """Ask all to end, those first that still have something to hand in; the exit codes."""
+        joined = [s for s in self.services.values() if s.role not in ("replay", "router")]
         for service in self.services.values():
             service.away = True
-            if service.role not in ("replay", "router"):
-                service.process.signal(signal.SIGTERM)
+        for service in joined:
+            service.process.signal(signal.SIGTERM)
+        for service in joined:
+            with suppress(subprocess.TimeoutExpired):
+                service.process.wait(2 * STOP_DEADLINE_S)
         return {name: self.services[name].process.end() for name in reversed(self.services)}
 
     def logs(self) -> str:
