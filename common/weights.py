@@ -4,6 +4,7 @@ Invariants: what a reader returns only ever gets newer, by (epoch, version); a m
 torn, altered or foreign is counted and dropped. Bytes in, bytes out: nothing here knows torch.
 """
 
+import contextlib
 import logging
 import math
 import threading
@@ -15,12 +16,13 @@ from common.framing import Part
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Weights
-from common.transport import Session
+from common.transport import PendingReply, Session
 from common.wire import decode, encode
 
 _LOG = logging.getLogger("weights")
 _TAKE_S = 0.2
 _ASK_AGAIN_S = 0.5
+_SILENCE_S = 20.0
 
 
 class WeightsWriter:
@@ -86,11 +88,18 @@ class WeightsWriter:
 
 
 class WeightsReader:
-    """Follows the newest weights of a run."""
+    """Follows the newest weights of a run.
 
-    def __init__(self, session: Session, keys: Keys) -> None:
+    silence_s: without a publication for so long, the learner is asked: a link that was out may
+    come back with all but its subscriptions.
+    """
+
+    def __init__(self, session: Session, keys: Keys, *, silence_s: float = _SILENCE_S) -> None:
         self._subscriber = session.latest_subscriber(keys.weights)
         self._client = session.client(keys.weights, "the learner", timeout_s=2.0)
+        self._silence_s = silence_s
+        self._heard_s = time.monotonic()
+        self._asked: PendingReply | None = None
         self._order = (-1, -1)
         self._refused = 0
 
@@ -101,7 +110,11 @@ class WeightsReader:
 
     def latest(self, timeout_s: float = 0.0) -> Weights | None:
         """Weights newer than the last returned; None where none came within the time."""
-        return self._newer(self._subscriber.take(timeout_s))
+        published = self._subscriber.take(timeout_s)
+        if published is None:
+            return self._newer(self._answer())
+        self._heard_s = time.monotonic()
+        return self._newer(published)
 
     def wait(
         self,
@@ -123,6 +136,22 @@ class WeightsReader:
                 told = True
             meanwhile()
         return None
+
+    def _answer(self) -> Part | None:
+        """To a question after a long silence, if it is there; asks where one is due."""
+        if self._asked is None:
+            if time.monotonic() - self._heard_s >= self._silence_s:
+                self._heard_s = time.monotonic()
+                with contextlib.suppress(TransportError):  # asked again when it is due
+                    self._asked = self._client.ask(b"")
+            return None
+        if not self._asked.wait(0.0):
+            return None
+        asked, self._asked = self._asked, None
+        try:
+            return asked.result()
+        except TransportError:
+            return None
 
     def _ask(self) -> Part | None:
         try:

@@ -1,5 +1,6 @@
 """Whoever follows weights never sees torn or older ones, whatever comes in whatever order."""
 
+import time
 from concurrent.futures import Future
 from typing import Any
 
@@ -8,10 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.config import TransportConfig
 from common.errors import DeadlineError, WireError
 from common.keys import Keys
 from common.process import StopSignal
 from common.trajectory import Weights
+from common.transport import Session, free_endpoint
 from common.weights import WeightsReader
 from common.wire import decode, encode
 
@@ -112,3 +115,25 @@ def test_a_torn_answer_is_not_taken_for_the_first_weights() -> None:
     found = reader.wait(StopSignal())
     assert found is not None
     assert (found.version, reader.refused) == (4, 1)
+
+
+def test_a_reader_that_hears_nothing_asks_the_learner() -> None:
+    endpoint, keys = free_endpoint(), Keys("silence")
+    joined = TransportConfig(connect=(endpoint,))
+    with (
+        Session(TransportConfig(listen=(endpoint,))),
+        Session(joined) as learner,
+        Session(joined) as actor,
+    ):
+        server = learner.server(keys.weights)
+        reader = WeightsReader(actor, keys, silence_s=0.1)
+        for version in (1, 2):
+            newest = Weights.of(0, version, 10 * version, payload_of(0, version))
+            found, deadline = None, time.monotonic() + 60
+            while found is None:
+                assert time.monotonic() < deadline, f"version {version} was not asked for"
+                request = server.take(0.05)
+                if request is not None:
+                    request.reply(encode(newest))
+                found = reader.latest(0.05)
+            assert found == newest
