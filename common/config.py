@@ -22,6 +22,7 @@ from common.errors import ConfigError
 
 ENV_PREFIX = "MRCDRL_"
 EXTENDS = "extends"
+_FINEST_PX = 2.5  # of the arena: smaller pixels of a picture are drawn literally
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -99,7 +100,7 @@ class ArenaConfig(Section):
     """Frames after which an episode is truncated (and bootstrapped). (ours)"""
     view_px: Annotated[int, Field(ge=31, le=255)] = 60
     """Width and height of a robot's picture. (paper)"""
-    crop_px: Positive = 600
+    crop_px: Annotated[float, Field(ge=1)] = 600
     """w = h of the rectangle cut out around the robot. (ours: not given; 600 shows the half
     around it)"""
     orientation: Literal["unrotated", "heading_up"] = "unrotated"
@@ -108,7 +109,8 @@ class ArenaConfig(Section):
     """Consecutive pictures that make a state. (paper)"""
     renderer: Literal["analytic", "literal"] = "analytic"
     """`literal` draws 600x600, greys, crops, pads and area-resizes as the paper does; `analytic`
-    computes the same coverage straight at 60x60. (ours)"""
+    computes the same coverage straight at 60x60, but where a picture's pixel is less than 2.5 px of
+    the arena: there single pixels of the drawing show, and it draws as `literal` does. (ours)"""
     pixel_noise: Annotated[float, Field(ge=0)] = 0
     """Standard deviation of the noise on every pixel of a robot's picture, in levels of grey.
     (ours)"""
@@ -126,6 +128,11 @@ class ArenaConfig(Section):
     def obstacle_count(self) -> int:
         """Discs of an episode."""
         return len(self.obstacles_px) + self.num_obstacles
+
+    @property
+    def draws_analytically(self) -> bool:
+        """Whether pictures are computed from the poses."""
+        return self.renderer == "analytic" and self.crop_px >= _FINEST_PX * self.view_px
 
     @property
     def record_bytes(self) -> int:

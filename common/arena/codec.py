@@ -52,7 +52,7 @@ class SceneCodec:
         self._ends = tuple(accumulate(counts))  # of robots, targets, obstacles
         self.record_bytes = _NUMBER.itemsize * (self._ends[-1] + bool(config.pixel_noise))
         self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
-        self._views = AnalyticViews(config) if config.renderer == "analytic" else None
+        self._views = AnalyticViews(config) if config.draws_analytically else None
 
     def __repr__(self) -> str:
         return f"SceneCodec(record_bytes={self.record_bytes})"

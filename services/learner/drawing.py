@@ -119,7 +119,7 @@ def make_drawing(
 
     threads: that draw on the host; the caller's own if None.
     """
-    scenes = config.codec == "scene" and config.renderer == "analytic"
+    scenes = config.codec == "scene" and config.draws_analytically
     more = config.obstacle_count or config.inner_walls_px or config.pixel_noise
     if device.type == "cuda" and scenes and not more:
         return DeviceDrawing(config, device)

@@ -32,7 +32,7 @@ def views(config: ArenaConfig, scene: Scene) -> UInt8Array:
 
 
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
-@pytest.mark.parametrize("crop_px", [150, 200, 300, 600, 1200])
+@pytest.mark.parametrize("crop_px", [60, 149, 150, 200, 300, 600, 1200])
 def test_analytic_is_what_opencv_draws(crop_px: int, orientation: str) -> None:
     config = ArenaConfig.model_validate(
         {

@@ -49,7 +49,7 @@ def largest_gap(one: UInt8Array, other: UInt8Array) -> int:
 @given(
     num_robots=st.integers(1, 10),
     orientation=st.sampled_from(["unrotated", "heading_up"]),
-    crop_px=st.floats(100, 1500),
+    crop_px=st.floats(150, 1500),
     view_px=st.sampled_from([31, 60]),
     seed=st.integers(0, 2**32),
 )
