@@ -1,19 +1,21 @@
 """What the log of a run holds, read from its files alone: nothing is changed, nobody is asked.
 
 Invariants: chunks are taken, numbered and left out as a service that starts would; the table is
-the one it would have, without the records. A log that is being written may be read meanwhile.
+the one it would have, with digests in place of records. A log that is being written may be read
+meanwhile.
 """
 
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
 
 from common.config import Config
 from common.errors import RunDirectoryError, WireError
-from common.trajectory import Chunk, Float32Array
+from common.trajectory import Chunk, Float32Array, UInt8Array
 from common.wire import decode
 from services.replay.__main__ import build
 from services.replay.limiter import RateLimiter
@@ -22,6 +24,8 @@ from services.replay.sampler import priorities_of
 from services.replay.sequence import Arrival, SequenceBook
 from services.replay.snapshot import Snapshot, read_snapshot
 from services.replay.table import Table
+
+_DIGEST_BYTES = 8
 
 
 @dataclass(slots=True)
@@ -40,7 +44,7 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class Rebuilt:
-    """The table that a service would have after a start, its records left out."""
+    """The table that a service would have after a start, but for its records."""
 
     table: Table
     limiter: RateLimiter
@@ -86,26 +90,27 @@ def read_contents(directory: Path, config: Config | None, *, records: bool = Fal
     keep the observation records; otherwise each chunk's have no columns.
     """
     contents, book = Contents(), SequenceBook()
-    table, limiter = (None, None) if config is None else build(config, record_bytes=0)
+    table, limiter = (None, None) if config is None else build(config, record_bytes=_DIGEST_BYTES)
     next_key = _first_key(directory)
     if table is not None:
         table.number_from(next_key)
     for payload in _payloads(directory, contents.files):
         try:
             chunk = decode(Chunk, payload)
-            bare = replace(chunk, records=np.empty((len(chunk.records), 0), np.uint8))
             if book.classify(chunk.actor, chunk.incarnation, chunk.sequence) is Arrival.REPEATED:
                 contents.files.duplicate_chunks += 1
                 continue
             if table is not None and config is not None:
                 _check_record(chunk, config)
-                table.insert(bare)
+                table.insert(replace(chunk, records=_digests(chunk.records)))
         except WireError:
             contents.files.left_out_chunks += 1
             continue
         book.record(chunk.actor, chunk.incarnation, chunk.sequence)
         contents.keys.append(next_key)
-        contents.chunks.append(chunk if records else bare)
+        if not records:
+            chunk = replace(chunk, records=np.empty((len(chunk.records), 0), np.uint8))
+        contents.chunks.append(chunk)
         next_key += len(chunk)
     if config is not None and table is not None and limiter is not None:
         contents.rebuilt = _rebuilt(directory, config, table, limiter)
@@ -123,6 +128,12 @@ def _rebuilt(directory: Path, config: Config, table: Table, limiter: RateLimiter
 def _check_record(chunk: Chunk, config: Config) -> None:
     if chunk.records.shape[1] != config.arena.record_bytes:
         raise WireError("records of another arena")
+
+
+def _digests(records: UInt8Array) -> UInt8Array:
+    """By which the table knows equal records, uint8 [N, D] of [N, R]."""
+    digests = (blake2b(record, digest_size=_DIGEST_BYTES).digest() for record in records)
+    return np.frombuffer(b"".join(digests), np.uint8).reshape(-1, _DIGEST_BYTES)
 
 
 def _first_key(directory: Path) -> int:

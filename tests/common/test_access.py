@@ -26,6 +26,7 @@ RUN = Keys("access")
 ROLES = ("replay", "learner", "actor", "evaluator", "status", "robot")
 SERVED = {
     "config": RUN.config,
+    "leases": RUN.leases,
     "insert": RUN.insert(),
     "sample": RUN.sample(),
     "priorities": RUN.priorities(),
@@ -56,7 +57,7 @@ MAY = {
     "replay": Row(
         put=("stats of replay",),
         ask=(),
-        serve=("config", "insert", "sample", "priorities"),
+        serve=("config", "leases", "insert", "sample", "priorities"),
         announce=("live replay",),
     ),
     "learner": Row(
@@ -68,9 +69,8 @@ MAY = {
     "actor": Row(
         put=("episodes", "stats of actor"),
         follow=("weights",),
-        ask=("config", "insert", "weights"),
+        ask=("config", "leases", "insert", "weights"),
         announce=("live actor",),
-        watch=("live actor",),
     ),
     "evaluator": Row(
         put=("evaluation", "stats of evaluator"),
@@ -80,6 +80,7 @@ MAY = {
     ),
     "status": Row(
         follow=("episodes", "evaluation", *(f"stats of {role}" for role in ROLES)),
+        announce=("live status",),
         watch=tuple(LIVE),
     ),
     "robot": Row(follow=("weights",), ask=("config", "weights")),

@@ -92,6 +92,8 @@ def test_the_command_is_that_of_compose(name: str) -> None:
         assert {e["name"] for e in container(name)["env"]} >= {"SHARD"}
         arguments = arguments[:-2]
     assert arguments == composed
+    environment = {e["name"]: e.get("value") for e in container(name).get("env", [])}
+    assert environment.items() >= COMPOSE["services"][name].get("environment", {}).items()
 
 
 @workloads
@@ -188,7 +190,8 @@ def test_services_lead_to_what_listens() -> None:
     (port,) = services["router"]["ports"]
     assert f"tcp/0.0.0.0:{port['targetPort']}" in container("router")["args"]
     for name in set(WORKLOADS) - {"router"}:
-        assert f"tcp/router:{port['port']}" in container(name)["args"]
+        environment = {e["name"]: e.get("value") for e in container(name)["env"]}
+        assert f'"tcp/router:{port["port"]}"' in environment["MRCDRL_TRANSPORT__CONNECT"]
 
 
 def test_nobody_else_reaches_the_run() -> None:

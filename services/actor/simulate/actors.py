@@ -24,6 +24,7 @@ from common.errors import MrcdrlError
 from common.keys import Keys
 from common.process import StatsReporter, StopSignal
 from common.trajectory import (
+    NO_SLOT,
     NUM_ACTIONS,
     Chunk,
     EpisodeSummary,
@@ -220,7 +221,7 @@ class SimulatedActor:
             "inserts_acknowledged": self.sender.transitions,
             "spool_chunks": self.sender.spooled,
         }
-        return dict.fromkeys(NOT_SIMULATED, 0.0) | told
+        return dict.fromkeys(NOT_SIMULATED, 0.0) | {"slot": NO_SLOT} | told
 
 
 NOT_SIMULATED = (

@@ -39,7 +39,14 @@ def test_chunks_are_those_of_whole_episodes(settings: dict[str, str], priorities
 
 
 def test_every_metric_of_an_actor_is_told() -> None:
-    simulated = {"robot_steps", "episodes", "chunks", "inserts_acknowledged", "spool_chunks"}
+    simulated = {
+        "robot_steps",
+        "episodes",
+        "chunks",
+        "inserts_acknowledged",
+        "spool_chunks",
+        "slot",
+    }
     assert simulated | set(NOT_SIMULATED) == published("actor")
     assert not simulated & set(NOT_SIMULATED)
 
