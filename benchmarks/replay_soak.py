@@ -131,10 +131,13 @@ def watch(
 
 
 def memory_mib(process: int) -> float:
-    """Proportional share: memory that clients lend counts for a half."""
+    """Proportional share: memory that clients lend counts for a half.
+
+    Without mapped files: what libraries count for depends on how many others have them open.
+    """
     rollup = Path(f"/proc/{process}/smaps_rollup").read_text("ascii")
-    line = next(line for line in rollup.splitlines() if line.startswith("Pss:"))
-    return int(line.split()[1]) / 1024
+    fields = dict(line.split()[:2] for line in rollup.splitlines()[1:])
+    return (int(fields["Pss_Anon:"]) + int(fields["Pss_Shmem:"])) / 1024
 
 
 def insert(
