@@ -18,9 +18,12 @@ RUN_CONFIG = "config.toml"  # of a run's folder, like the next
 BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"
 
 
-def write_synced(path: Path, content: bytes) -> None:
-    """Write a new file and wait until it is on the disk; raises OSError."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+def write_synced(path: Path, content: bytes, mode: int = 0o644) -> None:
+    """Write a new file and wait until it is on the disk; raises OSError.
+
+    mode: who may read and write it, from its first byte on.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
     try:
         remaining = memoryview(content)
         while remaining:
@@ -39,14 +42,14 @@ def sync_directory(path: Path) -> None:
         os.close(descriptor)
 
 
-def atomic_write(path: Path, content: bytes) -> None:
+def atomic_write(path: Path, content: bytes, mode: int = 0o644) -> None:
     """Write or replace a file in one step; on OSError the old one is as it was.
 
-    Two writers at once are safe, the last wins.
+    mode: as `write_synced` takes it. Two writers at once are safe, the last wins.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
     try:
-        write_synced(temporary, content)
+        write_synced(temporary, content, mode)
         temporary.replace(path)
     except OSError:
         temporary.unlink(missing_ok=True)

@@ -12,7 +12,6 @@ router's certificate is accepted from one who listens.
 
 import datetime
 import ipaddress
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.errors import ConfigError
+from common.files import atomic_write
 from common.keys import check_name
 
 _LISTENING = ("router",)
@@ -73,8 +73,8 @@ class Credentials:
         """Both files, the key first: who has a certificate has its key."""
         folder.mkdir(parents=True, exist_ok=True)
         pem = self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-        _write(folder / _KEY, pem, 0o600)
-        _write(folder / _CERTIFICATE, _pem(self.certificate), 0o644)
+        atomic_write(folder / _KEY, pem, 0o600)
+        atomic_write(folder / _CERTIFICATE, _pem(self.certificate), 0o644)
 
 
 def make(
@@ -95,7 +95,7 @@ def make(
         there = Credentials.read(folder / role)
         if there is None or not authority.issued(there.certificate):
             (folder / role).mkdir(parents=True, exist_ok=True)
-            _write(folder / role / "ca.pem", _pem(authority.certificate), 0o644)
+            atomic_write(folder / role / "ca.pem", _pem(authority.certificate), 0o644)
             _of_role(role, authority, hosts, valid).write(folder / role)
             made.append(role)
     return made
@@ -172,12 +172,3 @@ def _host(host: str) -> x509.GeneralName:
 
 def _pem(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(Encoding.PEM)
-
-
-def _write(path: Path, content: bytes, mode: int) -> None:
-    """The whole file or none, never readable to more than `mode` says."""
-    new = path.with_suffix(".new")
-    new.unlink(missing_ok=True)
-    with os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        file.write(content)
-    new.replace(path)
