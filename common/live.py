@@ -12,12 +12,11 @@ import contextlib
 import logging
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from common.closing import Closing
 from common.config import load_transport
 from common.errors import CheckpointError, DeadlineError
 from common.policy import FrameStack, make_policy
@@ -29,7 +28,7 @@ from common.weights import WeightsReader
 _LOG = logging.getLogger("live")
 
 
-class LivePolicy:
+class LivePolicy(Closing):
     """Follows a run's weights and acts by them; use it in `with`.
 
     run: its name. endpoint: where its replay service listens, such as tcp/HOST:7447. epsilon:
@@ -66,17 +65,6 @@ class LivePolicy:
                 )
             self._adopt(first)
             self._opened = opened.pop_all()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Leave the run; again is harmless."""

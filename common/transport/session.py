@@ -13,11 +13,11 @@ import socket
 import time
 from importlib import resources
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
+from common.closing import Closing
 from common.config import TransportConfig
 from common.errors import ConfigError, EndpointError
 from common.transport.publications import LatestSubscriber, Presence, Publisher, QueueSubscriber
@@ -49,7 +49,7 @@ _CLIENT_SETTINGS: dict[str, Any] = {
 }
 
 
-class Session:
+class Session(Closing):
     """An open Zenoh session: a router where it listens, a client otherwise.
 
     router_file: what to be as a router; by default configs/router.json5. `config` says where to
@@ -80,17 +80,6 @@ class Session:
         self._declared = contextlib.ExitStack()
         if self._listen:
             self._say_who_may_join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Undeclare everything and close; again is harmless."""

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
+from common.closing import Closing
 from common.config import Config
 from common.errors import RunDirectoryError
 from common.files import atomic_write, reason
@@ -49,7 +49,7 @@ EVALUATION_FIELDS = (
 )
 
 
-class Recorder:
+class Recorder(Closing):
     """Owns the open files of one run's directory; close it, or use it in `with`."""
 
     def __init__(self, run_dir: Path, config: Config) -> None:
@@ -69,17 +69,6 @@ class Recorder:
 
     def __repr__(self) -> str:
         return f"Recorder({str(self.run_dir)!r}, closed={self._metrics.closed})"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def restore(self, state: RunState, rule: StoppingRule) -> float:
         """Folds what earlier processes of this run recorded; returns the seconds it lasted.

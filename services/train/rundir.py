@@ -12,9 +12,9 @@ import os
 import shutil
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
+from common.closing import Closing
 from common.config import Config, load_config, to_toml
 from common.errors import RunDirectoryError
 from common.files import RUN_CONFIG, atomic_write, reason
@@ -29,7 +29,7 @@ def default_name(config_name: str, num_robots: int) -> str:
     return f"{stem}-{num_robots}robots-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-class RunDirectory:
+class RunDirectory(Closing):
     """The folder of one run, locked while the object lives.
 
     Raises RunDirectoryError where it exists (`create`), does not (`resume`), is in use by
@@ -96,17 +96,6 @@ class RunDirectory:
         except OSError as error:
             raise RunDirectoryError(f"cannot write {path}: {reason(error)}") from error
         return run
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     @property
     def logs(self) -> Path:

@@ -220,8 +220,9 @@ class SimulatedActor:
             "chunks": self.sender.chunks,
             "inserts_acknowledged": self.sender.transitions,
             "spool_chunks": self.sender.spooled,
+            "slot": NO_SLOT,
         }
-        return dict.fromkeys(NOT_SIMULATED, 0.0) | {"slot": NO_SLOT} | told
+        return dict.fromkeys(NOT_SIMULATED, 0.0) | told
 
 
 NOT_SIMULATED = (
