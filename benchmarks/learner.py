@@ -7,9 +7,11 @@
 DIR is the folder of the harness with `bench_learner.py`; without it, or with --rounds 0, only we
 are measured: on a GPU steps as learner.step = auto makes them beside eager ones. A step is three
 forward passes, one backward, the optimiser, and reading back the absolute TD errors that
-prioritized replay wants (on a GPU those of the launch before, so that none is waited for). Each
-system prints its line of JSON, round after round, with its share of what a large matrix product
-reaches with the same threads; then a table of medians goes to stderr. `--run DIR` adds how many
+prioritized replay wants (on a GPU those of the launch before, so that none is waited for). Our
+pictures are those of --robots playing at random in the default arena: what is black of them costs
+a CPU nothing (`common/first_layer.py`). `--pictures noise` has no black in it. Each system prints
+its line of JSON, round after round, with its share of what a large matrix product reaches with the
+same threads; then a table of medians goes to stderr. `--run DIR` adds how many
 transitions a second the learner of a recorded run consumed in its best minute, over Zenoh and
 with all else running.
 `--profile` prints the operations that take the longest instead.
@@ -31,14 +33,17 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.machine import emit, seconds_per_call, spread
 from benchmarks.replay_peers import run
-from common.config import AgentConfig, LearnerConfig
+from common.arena import ArenaBatch, make_codec
+from common.config import AgentConfig, ArenaConfig, LearnerConfig
 from common.network import Precision
 from common.process import ALLOCATOR
+from common.trajectory import NUM_ACTIONS
 from services.dashboard.records import METRICS
 from services.learner.batch import Batch
 from services.learner.learner import Learner
 
 _BATCHES = 8  # in turns, as the harness does
+_STACK, _VIEW_PX = 4, 60
 _MATRIX = 1024  # side of the matrices whose product is taken for the peak
 CLEANRL = ("--impl", "cleanrl")
 TUNED = (*CLEANRL, "--channels-last", "--fused")
@@ -54,6 +59,8 @@ def main() -> None:
     parser.add_argument("--step", choices=["auto", "eager", "graph"])
     parser.add_argument("--batches", type=int, nargs="+", default=[32, 512])
     parser.add_argument("--precision", default="auto", choices=["auto", "float32", "bfloat16"])
+    parser.add_argument("--pictures", choices=["arena", "noise"], default="arena")
+    parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--reps", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=2)
@@ -81,6 +88,7 @@ def in_turns(arguments: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     timing = [f"--{name}={getattr(arguments, name)}" for name in ("threads", "seconds", "reps")]
     module = [sys.executable, "-m", "benchmarks.learner", *timing, "--batches"]
     module += map(str, arguments.batches)
+    module += [f"--pictures={arguments.pictures}", f"--robots={arguments.robots}"]
     systems: dict[str, tuple[list[str], dict[str, str]]] = {}
     if arguments.peers is not None:
         script = [sys.executable, str(arguments.peers / "bench_learner.py"), *timing]
@@ -125,11 +133,13 @@ def ours(arguments: argparse.Namespace) -> dict[str, object]:
         "threads": arguments.threads,
         "dtype": str(dtype),
         "learner": repr(learner),
+        "pictures": arguments.pictures,
+        "robots": arguments.robots,
         **{f"{_name(p)}_gflops_peak": round(f / 1e9, 1) for p, f in peak.items()},
     }
     for size in arguments.batches:
         learner = make_learner(arguments)
-        launch = endless_steps(learner, size)
+        launch = endless_steps(learner, size, arguments)
         for _ in range(10):  # the first ones record what the others replay
             launch()
         updates = [
@@ -154,14 +164,21 @@ def make_learner(arguments: argparse.Namespace, threads: int | None = None) -> L
         precision=arguments.precision, device=arguments.device, step=arguments.step or "auto"
     )
     return Learner(
-        AgentConfig(), settings, stack=4, view_px=60, threads=threads or arguments.threads
+        AgentConfig(),
+        settings,
+        stack=_STACK,
+        view_px=_VIEW_PX,
+        threads=threads or arguments.threads,
     )
 
 
-def endless_steps(learner: Learner, size: int) -> Any:
+def endless_steps(learner: Learner, size: int, arguments: argparse.Namespace) -> Any:
     """What makes one launch's steps at each call, and reads TD errors back."""
     batches = itertools.cycle(
-        [random_batch(size, seed).map(lambda x: x.to(learner.device)) for seed in range(_BATCHES)]
+        [
+            random_batch(size, seed, arguments).map(lambda x: x.to(learner.device))
+            for seed in range(_BATCHES)
+        ]
     )
     waiting: deque[Any] = deque()
     late = learner.device.type == "cuda"
@@ -178,7 +195,8 @@ def endless_steps(learner: Learner, size: int) -> Any:
 def flops_of_a_step(arguments: argparse.Namespace, size: int) -> int:
     """Of products and convolutions, a multiplication and an addition being two."""
     learner = make_learner(argparse.Namespace(**{**vars(arguments), "step": "eager"}), threads=1)
-    batch = random_batch(size, 0).map(lambda x: x.to(learner.device))
+    noise = argparse.Namespace(pictures="noise")
+    batch = random_batch(size, 0, noise).map(lambda x: x.to(learner.device))
     with FlopCounterMode(display=False) as counter:
         learner.step(batch)
     return int(counter.get_total_flops())
@@ -211,7 +229,7 @@ def consumed(run_dir: Path) -> float:
 def profiled(arguments: argparse.Namespace) -> None:
     """Prints a table of operations for each size of batch, of one thread."""
     for size in arguments.batches:
-        launch = endless_steps(make_learner(arguments, threads=1), size)
+        launch = endless_steps(make_learner(arguments, threads=1), size, arguments)
         for _ in range(10):
             launch()
         kinds = [ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * on_gpu(arguments)]
@@ -223,10 +241,14 @@ def profiled(arguments: argparse.Namespace) -> None:
         print(taken.key_averages().table(sort_by=key, row_limit=20, max_name_column_width=44))
 
 
-def random_batch(size: int, seed: int) -> Batch:
-    """As large as real ones; what the pixels are makes no difference to the time."""
+def random_batch(size: int, seed: int, arguments: argparse.Namespace) -> Batch:
+    """Of random transitions, with the pictures that the arguments want."""
     generator = torch.Generator().manual_seed(seed)
-    pictures = torch.randint(0, 256, (2, size, 4, 60, 60), dtype=torch.uint8, generator=generator)
+    if arguments.pictures == "noise":
+        shape = (2, size, _STACK, _VIEW_PX, _VIEW_PX)
+        pictures = torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
+    else:
+        pictures = arena_states(2 * size, seed, arguments.robots).unflatten(0, (2, size))
     return Batch(
         observation=pictures[0],
         action=torch.randint(0, 3, (size,), generator=generator),
@@ -236,6 +258,23 @@ def random_batch(size: int, seed: int) -> Batch:
         importance_weights=torch.ones(size),
         keys=np.arange(size),
     )
+
+
+def arena_states(count: int, seed: int, num_robots: int) -> torch.Tensor:
+    """States uint8 [count, S, V, V] of robots that play at random, each state of another time."""
+    config = ArenaConfig(num_robots=num_robots)
+    codec, rng = make_codec(config), np.random.default_rng(seed)
+    arenas = ArenaBatch(
+        config, rng.spawn(-(-count // num_robots)), max_collisions=config.max_frames
+    )
+    for i in range(len(arenas)):
+        arenas.reset(i)
+    pictures = []
+    for _ in range(_STACK):
+        actions = rng.integers(NUM_ACTIONS, size=(len(arenas), num_robots), dtype=np.uint8)
+        records = arenas.step(actions).records
+        pictures.append(codec.decode(records.reshape(-1, records.shape[-1])))
+    return torch.from_numpy(np.stack(pictures, axis=1)[:count])
 
 
 def _name(dtype: torch.dtype) -> str:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from common.errors import CheckpointError, ConfigError
+from common.first_layer import LitPixels, first_layer, lit_pixels
 from common.trajectory import NUM_ACTIONS
 
 Kind = Literal["duel", "ddqn", "dqn"]
@@ -31,8 +32,9 @@ FORMAT_VERSION: Final = 1
 SENT_AS: Final = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _METADATA_KEY: Final = "mrcdrl"  # one JSON text: safetensors does not keep an order of several
 _WHITE: Final = 255.0
-_OUTPUTS: Final = ("value.", "advantage.", "action_value.")  # float32 always
+_FLOAT32 = ("conv1.", "value.", "advantage.", "action_value.")  # operands that are it always
 
+States = Tensor | LitPixels  # as the first layer takes them
 Operands = dict[str, Tensor]  # by parameter name
 
 
@@ -118,11 +120,22 @@ class QNetwork(nn.Module):
             self.action_value = nn.Linear(HIDDEN_UNITS, num_actions)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Values float32 [B, num_actions] of states uint8 [B, S, V, V]."""
-        return self.evaluate(self.prepare(observation), self.operands())
+        """Values float32 [B, num_actions] of states uint8 [B, S, V, V], by torch alone."""
+        return self.evaluate(self._dense(observation), self.operands())
 
-    def prepare(self, observation: Tensor) -> Tensor:
-        """States uint8 [B, S, V, V] in the dtype and memory order of the first convolution.
+    def prepare(self, observation: Tensor) -> States:
+        """States uint8 [B, S, V, V] as the first layer is fastest on them.
+
+        On a CPU those that are mostly black are what is not black of them.
+        """
+        if observation.device.type == "cpu":
+            lit = lit_pixels(observation)
+            if lit is not None:
+                return lit
+        return self._dense(observation)
+
+    def _dense(self, observation: Tensor) -> Tensor:
+        """In the dtype and memory order of a convolution.
 
         In two passes: converting and reordering at once is twice as slow on a CPU.
         """
@@ -137,7 +150,7 @@ class QNetwork(nn.Module):
         operands: Operands = dict(self.named_parameters())
         operands["conv1.weight"] = operands["conv1.weight"] / _WHITE
         for name, parameter in operands.items():
-            if not name.startswith(_OUTPUTS):
+            if not name.startswith(_FLOAT32):
                 operands[name] = parameter.to(self.compute_dtype)
         return operands
 
@@ -159,15 +172,20 @@ class QNetwork(nn.Module):
         gradients[0] /= _WHITE  # as the operand is the parameter over it
 
     def evaluate(
-        self, states: Tensor, operands: Operands, seen: list[Tensor] | None = None
+        self, states: States, operands: Operands, seen: list[Tensor] | None = None
     ) -> Tensor:
         """Values float32 [B, num_actions] of what `prepare` and `operands` returned.
 
         Pooling before the ReLU is the same as after it, on a quarter of the numbers. seen: where
         each hidden layer's outputs go, if anywhere.
         """
-        x = functional.conv2d(states, operands["conv1.weight"], operands["conv1.bias"], stride=2)
-        x = _relu(functional.max_pool2d(x, 2), seen)
+        weight, bias = operands["conv1.weight"], operands["conv1.bias"]
+        if isinstance(states, LitPixels):
+            x = _noted(first_layer(states, weight, bias).to(self.compute_dtype), seen)
+        else:
+            weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)
+            x = functional.max_pool2d(functional.conv2d(states, weight, bias, stride=2), 2)
+            x = _relu(x, seen)
         x = functional.conv2d(x, operands["conv2.weight"], operands["conv2.bias"], stride=2)
         x = _relu(x, seen)
         x = functional.conv2d(x, operands["conv3.weight"], operands["conv3.bias"])
@@ -190,7 +208,10 @@ def _stream(
 
 def _relu(x: Tensor, seen: list[Tensor] | None) -> Tensor:
     """In place."""
-    x = functional.relu_(x)
+    return _noted(functional.relu_(x), seen)
+
+
+def _noted(x: Tensor, seen: list[Tensor] | None) -> Tensor:
     if seen is not None:
         seen.append(x)
     return x

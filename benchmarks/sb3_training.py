@@ -1,0 +1,177 @@
+"""stable-baselines3's DQN, trained with two robots until 90 starts of 100 of the test succeed.
+
+    python -m benchmarks.sb3_training --minutes 90 --threads 1 >> RESULTS.jsonl
+
+All that it can be told of what our preset quick does, it is told: the paper's convolutions, 3-step
+returns, Huber loss, the scale of rewards, the learning rate and its schedule, Adam's epsilon, the
+target's period, exploration by updates, and a batch of 32 every 4 robot steps. It has no double
+targets, duel network or symmetries. One line of JSON with the successes of the last 100 training
+episodes every 1000 updates, and one for each test, of which the first comes when half of those
+episodes succeeded.
+"""
+
+import argparse
+import contextlib
+import time
+from collections import deque
+
+import numpy as np
+import torch
+from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from benchmarks.machine import emit
+from benchmarks.sb3_dqn import ARENAS, BATCH, NETWORKS, ROBOTS, TRAIN_FREQUENCY
+from common.arena import test_starts
+from common.arena.codec import make_codec
+from common.arena.sb3 import ArenaVecEnv
+from common.config import ArenaConfig, Config, load_config
+from common.policy import Selection
+from common.schedule import value_at
+from common.trajectory import BoolArray, Float32Array, Outcome, UInt8Array
+from services.evaluator.trial import PER, PolicyPlayer, play
+
+_TELL_UPDATES = 1_000
+_TEST_UPDATES = 2_500
+_TESTED_FROM = 50  # successes of the last 100 training episodes
+_BUFFER = 200_000
+
+
+class ScaledRewards(VecEnvWrapper):  # type: ignore[misc]
+    """Rewards as our learner sees them."""
+
+    def __init__(self, arenas: ArenaVecEnv, scale: float) -> None:
+        super().__init__(arenas)
+        self._scale = scale
+
+    def reset(self) -> UInt8Array:
+        return self.venv.reset()  # type: ignore[no-any-return]
+
+    def step_wait(self) -> tuple[UInt8Array, Float32Array, BoolArray, list[dict[str, object]]]:
+        states, rewards, ends, infos = self.venv.step_wait()
+        return states, rewards * self._scale, ends, infos
+
+
+class Greedy:
+    """The model's values, acted by as our evaluator acts by ours."""
+
+    def __init__(self, model: DQN) -> None:
+        self._model = model
+
+    def select_actions(
+        self, observations: UInt8Array, epsilon: float, rng: np.random.Generator
+    ) -> Selection:
+        with torch.inference_mode():
+            values = self._model.q_net(torch.from_numpy(observations)).numpy()
+        greedy = values.argmax(axis=1).astype(np.uint8)
+        uniform = rng.integers(values.shape[1], size=len(values), dtype=np.uint8)
+        actions = np.where(rng.random(len(values)) < epsilon, uniform, greedy)
+        return Selection(actions=actions, q_values=values, greedy_q=values.max(axis=1))
+
+
+class Judge(BaseCallback):  # type: ignore[misc]
+    """Tells how training goes, tests, and ends it at the wanted successes or when time is over."""
+
+    def __init__(self, arena: ArenaConfig, wanted: int, seconds: float) -> None:
+        super().__init__()
+        self._arena, self._wanted, self._seconds = arena, wanted, seconds
+        self._outcomes: deque[str] = deque(maxlen=PER)
+        self._began_s = time.perf_counter()
+        self._testing_s = 0.0
+        self._told = self._tested = 0
+
+    def _on_step(self) -> bool:
+        ended = np.flatnonzero(self.locals["dones"])[::ROBOTS]  # one robot of each arena
+        self._outcomes.extend(self.locals["infos"][i]["outcome"] for i in ended)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        updates = self.model._n_updates
+        if updates - self._told >= _TELL_UPDATES:
+            self._told = updates
+            self._tell()
+
+    def on_rollout_start(self) -> None:
+        super().on_rollout_start()
+        updates = self.model._n_updates
+        if updates - self._tested >= _TEST_UPDATES and self._successes >= _TESTED_FROM:
+            self._tested = updates
+            if self._test() >= self._wanted:
+                raise StopIteration
+        if self._learning_s >= self._seconds:
+            raise StopIteration
+
+    @property
+    def _successes(self) -> int:
+        return self._outcomes.count(Outcome.SUCCESS.value)
+
+    @property
+    def _learning_s(self) -> float:
+        return time.perf_counter() - self._began_s - self._testing_s
+
+    def _tell(self, **more: object) -> None:
+        emit(
+            {
+                "bench": "sb3_training",
+                "updates": self.model._n_updates,
+                "robot_steps": self.num_timesteps,
+                "minutes": round(self._learning_s / 60, 2),
+                "cpu_minutes": round(time.process_time() / 60, 2),
+                "training_successes_of_100": self._successes,
+                "epsilon": round(self.model.exploration_rate, 3),
+                **more,
+            }
+        )
+
+    def _test(self) -> int:
+        """Successes of the paper's test, which does not count as time of training."""
+        began_s = time.perf_counter()
+        config = Config(arena=self._arena)
+        player = PolicyPlayer(
+            self._arena, make_codec(self._arena), Greedy(self.model),  # type: ignore[arg-type]
+            config.evaluator.epsilon, np.random.default_rng(0),
+        )  # fmt: skip
+        results = play(self._arena, test_starts(self._arena, PER, 0), player) or []
+        successes = [r.outcome for r in results].count(Outcome.SUCCESS)
+        self._testing_s += time.perf_counter() - began_s
+        self._tell(test_successes_of_100=successes)
+        return successes
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=90)
+    parser.add_argument("--wanted", type=int, default=90, help="successes of 100")
+    parser.add_argument("--samples-per-step", type=int, default=8)
+    parser.add_argument("--threads", type=int, default=0, help="0: as PyTorch chooses")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    quick = load_config("quick", environ={})
+    agent, steps = quick.agent, ARENAS * ROBOTS * TRAIN_FREQUENCY
+    per_step = arguments.samples_per_step / BATCH  # updates
+    arenas = ScaledRewards(ArenaVecEnv(ARENAS, quick.arena), agent.reward_scale)
+    model = DQN(
+        "CnnPolicy", arenas, seed=arguments.seed,
+        policy_kwargs={
+            **NETWORKS["paper"], "optimizer_kwargs": {"eps": agent.optimizer_epsilon},
+        },
+        learning_rate=agent.learning_rate,
+        gamma=agent.gamma, n_steps=agent.n_step, batch_size=BATCH, train_freq=TRAIN_FREQUENCY,
+        gradient_steps=int(per_step * steps), buffer_size=_BUFFER,
+        learning_starts=quick.replay.min_size,
+        target_update_interval=int(agent.target_period / per_step),
+    )  # fmt: skip
+    model.lr_schedule = lambda _: (
+        agent.learning_rate * value_at(agent.learning_rate_schedule, model._n_updates)
+    )
+    model.exploration_schedule = lambda _: value_at(quick.exploration.schedule, model._n_updates)
+    judge = Judge(quick.arena, arguments.wanted, arguments.minutes * 60)
+    with contextlib.suppress(StopIteration):
+        model.learn(1_000_000_000, callback=judge)
+
+
+if __name__ == "__main__":
+    main()
