@@ -10,7 +10,7 @@ Shapes: B = states of a batch, S = pictures stacked in a state, V = width of a p
 
 import json
 import struct
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final, Literal, TypeGuard
 
 import torch
@@ -36,6 +36,15 @@ _FLOAT32 = ("conv1.", "value.", "advantage.", "action_value.")  # operands that 
 
 States = Tensor | LitPixels  # as the first layer takes them
 Operands = dict[str, Tensor]  # by parameter name
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """What an evaluation passed through."""
+
+    units: list[Tensor] = field(default_factory=list)  # outputs of each hidden layer
+    # of fully connected ones, by their weight's name: inputs [B, F], and sums before ReLU [B, U]
+    products: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
 
 def precision(setting: Precision, device: str | torch.device = "cpu") -> torch.dtype:
@@ -118,6 +127,8 @@ class QNetwork(nn.Module):
         else:
             self.hidden = nn.Linear(features, HIDDEN_UNITS)
             self.action_value = nn.Linear(HIDDEN_UNITS, num_actions)
+        hidden = ("value_hidden", "advantage_hidden") if kind == "duel" else ("hidden",)
+        self.hidden_weights = tuple(f"{name}.weight" for name in hidden)  # nearly all parameters
 
     def forward(self, observation: Tensor) -> Tensor:
         """Values float32 [B, num_actions] of states uint8 [B, S, V, V], by torch alone."""
@@ -154,67 +165,49 @@ class QNetwork(nn.Module):
                 operands[name] = parameter.to(self.compute_dtype)
         return operands
 
-    def set_gradients(self, of_operands: Sequence[tuple[Tensor, ...]]) -> None:
-        """Make the sums of these the gradients of the parameters, written in place.
+    def scale_gradients(self, gradients: Operands) -> None:
+        """From those of the operands to those of the parameters, in place."""
+        gradients["conv1.weight"] /= _WHITE
 
-        of_operands: for each part of a batch the gradients of what `operands` returned.
-        """
-        for parameter in self.parameters():
-            if parameter.grad is None:
-                parameter.grad = torch.empty_like(parameter)
-        gradients = [
-            parameter.grad for parameter in self.parameters() if parameter.grad is not None
-        ]
-        first, *others = of_operands
-        torch._foreach_copy_(gradients, first)
-        for other in others:
-            torch._foreach_add_(gradients, other)
-        gradients[0] /= _WHITE  # as the operand is the parameter over it
-
-    def evaluate(
-        self, states: States, operands: Operands, seen: list[Tensor] | None = None
-    ) -> Tensor:
+    def evaluate(self, states: States, operands: Operands, trace: Trace | None = None) -> Tensor:
         """Values float32 [B, num_actions] of what `prepare` and `operands` returned.
 
-        Pooling before the ReLU is the same as after it, on a quarter of the numbers. seen: where
-        each hidden layer's outputs go, if anywhere.
+        Pooling before the ReLU is the same as after it, on a quarter of the numbers. trace: is
+        filled, if given.
         """
+        trace = trace or Trace()
         weight, bias = operands["conv1.weight"], operands["conv1.bias"]
         if isinstance(states, LitPixels):
-            x = _noted(first_layer(states, weight, bias).to(self.compute_dtype), seen)
+            x = first_layer(states, weight, bias).to(self.compute_dtype)
         else:
             weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)
             x = functional.max_pool2d(functional.conv2d(states, weight, bias, stride=2), 2)
-            x = _relu(x, seen)
+            x = functional.relu_(x)
+        trace.units.append(x)
         x = functional.conv2d(x, operands["conv2.weight"], operands["conv2.bias"], stride=2)
-        x = _relu(x, seen)
+        x = functional.relu_(x)
+        trace.units.append(x)
         x = functional.conv2d(x, operands["conv3.weight"], operands["conv3.bias"])
-        features = _relu(x, seen).flatten(1)
+        x = functional.relu_(x)
+        trace.units.append(x)
+        features = x.flatten(1)
         if self.kind == "duel":
-            value = _stream(features, operands, "value_hidden", "value", seen)
-            advantage = _stream(features, operands, "advantage_hidden", "advantage", seen)
+            value = _stream(features, operands, "value_hidden", "value", trace)
+            advantage = _stream(features, operands, "advantage_hidden", "advantage", trace)
             return value + advantage - advantage.mean(dim=1, keepdim=True)
-        return _stream(features, operands, "hidden", "action_value", seen)
+        return _stream(features, operands, "hidden", "action_value", trace)
 
 
-def _stream(
-    features: Tensor, operands: Operands, hidden: str, output: str, seen: list[Tensor] | None
-) -> Tensor:
+def _stream(features: Tensor, operands: Operands, hidden: str, output: str, trace: Trace) -> Tensor:
     """A hidden layer and, in float32, an output layer."""
-    x = functional.linear(features, operands[f"{hidden}.weight"], operands[f"{hidden}.bias"])
-    x = _relu(x, seen).float()
-    return functional.linear(x, operands[f"{output}.weight"], operands[f"{output}.bias"])
-
-
-def _relu(x: Tensor, seen: list[Tensor] | None) -> Tensor:
-    """In place."""
-    return _noted(functional.relu_(x), seen)
-
-
-def _noted(x: Tensor, seen: list[Tensor] | None) -> Tensor:
-    if seen is not None:
-        seen.append(x)
-    return x
+    weight = f"{hidden}.weight"
+    sums = functional.linear(features, operands[weight], operands[f"{hidden}.bias"])
+    units = functional.relu(sums)
+    trace.units.append(units)
+    trace.products[weight] = features, sums
+    return functional.linear(
+        units.float(), operands[f"{output}.weight"], operands[f"{output}.bias"]
+    )
 
 
 def weights_to_bytes(network: QNetwork, dtype: torch.dtype = torch.float32) -> bytes:

@@ -21,6 +21,7 @@ from common.network import (
     SENT_AS,
     Operands,
     QNetwork,
+    Trace,
     load_weights,
     precision,
     read_arrays,
@@ -29,12 +30,11 @@ from common.network import (
 )
 from common.schedule import value_at
 from services.learner.batch import Batch
+from services.learner.descent import MOMENTS, Descent, Gradients, gradients, leaves
 from services.learner.launch import CudaGraphs, Recorder, Recording
 from services.learner.slices import Slices
 from services.learner.targets import double_dqn_target, dqn_target, td_loss
 from services.learner.update import Update
-
-RMSPROP_DECAY = 0.9  # of the ancestor's library
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class _Part:
     loss: Tensor  # float32 [], their share in the batch's
     greedy_q: Tensor  # float32 [rows]
     td_errors: Tensor  # float32 [rows]
-    gradients: tuple[Tensor, ...]  # of the loss, by operand
+    gradients: Gradients
 
 
 class Learner:
@@ -95,7 +95,7 @@ class Learner:
         self._target_operands = self.target.operands()
         self._copy_to_target()
         self._learning_rate = torch.zeros((), device=self.device)  # where a recorded step reads it
-        self._optimizer = self._make_optimizer()
+        self._descent = Descent(self.online, agent, self._learning_rate, self._slices)
 
     def __repr__(self) -> str:
         step = "eager" if self._recorder is None else f"graph of up to {self.updates_per_launch}"
@@ -146,9 +146,7 @@ class Learner:
         parts = self._slices.map(
             lambda rows: self._differentiate(scaled.map(lambda x: x[rows]), operands, size), size
         )
-        self.online.set_gradients([part.gradients for part in parts])
-        gradient_norm = self._clip_gradient()
-        self._optimizer.step()
+        gradient_norm = self._descent.step([part.gradients for part in parts])
         return Update(
             loss=torch.stack([part.loss for part in parts]).sum(),
             mean_q=torch.cat([part.greedy_q for part in parts]).mean(),
@@ -158,13 +156,13 @@ class Learner:
 
     def _differentiate(self, rows: Batch, operands: Operands, size: int) -> _Part:
         """Loss of these rows of a batch of that size, and its gradient."""
-        leaves = {name: x.detach().requires_grad_() for name, x in operands.items()}
         target = self._target(rows, operands)
-        q = self.online.evaluate(self.online.prepare(rows.observation), leaves)
+        own, trace = leaves(operands, self.online), Trace()
+        q = self.online.evaluate(self.online.prepare(rows.observation), own, trace)
         mean, td_errors = td_loss(q, rows.action, target, rows.importance_weights, self.agent.loss)
         loss = mean * (len(q) / size)
-        gradients = torch.autograd.grad(loss, list(leaves.values()))
-        return _Part(loss.detach(), q.detach().max(dim=1).values, td_errors, gradients)
+        greedy_q = q.detach().max(dim=1).values
+        return _Part(loss.detach(), greedy_q, td_errors, gradients(loss, own, trace))
 
     def payload(self) -> bytes:
         """The online parameters for publication; raises DivergedError if one is not finite."""
@@ -173,9 +171,8 @@ class Learner:
     def state(self) -> LearnerState:
         """A copy of everything; raises DivergedError if a number of it is not finite."""
         moments = {
-            f"{name}:{moment}": value.detach().cpu().contiguous()
-            for name, parameter in self.online.named_parameters()
-            for moment, value in self._optimizer.state[parameter].items()
+            name: moment.detach().cpu().contiguous()
+            for name, moment in self._descent.moments().items()
         }
         if not all(bool(torch.isfinite(moment).all()) for moment in moments.values()):
             raise self._diverged("the optimiser has moments that are not finite")
@@ -212,12 +209,7 @@ class Learner:
         load_weights(self.online, state.model)
         self._refresh_target_operands()
         self._recordings.clear()
-        self._optimizer = self._make_optimizer()
-        for name, parameter in self.online.named_parameters():
-            if moments:
-                self._optimizer.state[parameter] = {
-                    moment: moments[f"{name}:{moment}"] for moment in self._moments
-                }
+        self._descent.restore(moments)
         self.learner_step = state.learner_step
         self.rng.bit_generator.state = rng.bit_generator.state
 
@@ -227,7 +219,7 @@ class Learner:
         shapes = {
             f"{name}:{moment}": torch.Size() if moment == "step" else parameter.shape
             for name, parameter in self.online.named_parameters()
-            for moment in self._moments
+            for moment in MOMENTS[self.agent.optimizer]
         }
         if arrays and {name: array.shape for name, array in arrays.items()} != shapes:
             raise CheckpointError(
@@ -236,16 +228,8 @@ class Learner:
             )
         return {name: array.to(self.device, copy=True) for name, array in arrays.items()}
 
-    @property
-    def _moments(self) -> tuple[str, ...]:
-        return ("step", "exp_avg", "exp_avg_sq") if self._adam else ("step", "square_avg")
-
     def _rate_at(self, learner_step: int) -> float:
         return self.agent.learning_rate * value_at(self.agent.learning_rate_schedule, learner_step)
-
-    @property
-    def _adam(self) -> bool:
-        return self.agent.optimizer == "adam"
 
     def _target(self, rows: Batch, operands: Operands) -> Tensor:
         """y of Eq. (2), or of Eq. (4) for `dqn`, float32 [B]; operands: of the online network."""
@@ -265,24 +249,6 @@ class Learner:
         """In place: a recorded step reads them where they are."""
         operands = self.target.operands()
         torch._foreach_copy_(list(self._target_operands.values()), list(operands.values()))
-
-    def _clip_gradient(self) -> Tensor:
-        limit = self.agent.max_gradient_norm
-        parameters = list(self.online.parameters())
-        if limit > 0:
-            return torch.nn.utils.clip_grad_norm_(parameters, limit)
-        return torch.nn.utils.get_total_norm(p.grad for p in parameters if p.grad is not None)
-
-    def _make_optimizer(self) -> torch.optim.Optimizer:
-        parameters, capturable = list(self.online.parameters()), self.device.type == "cuda"
-        rate, epsilon = self._learning_rate, self.agent.optimizer_epsilon
-        if self._adam:
-            return torch.optim.Adam(
-                parameters, lr=rate, eps=epsilon, fused=True, capturable=capturable
-            )
-        return torch.optim.RMSprop(
-            parameters, lr=rate, eps=epsilon, alpha=RMSPROP_DECAY, capturable=capturable
-        )
 
 
 def _device_recorder(

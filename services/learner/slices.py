@@ -19,7 +19,7 @@ class Slices:
     """Up to `num` slices at once; the calling thread's torch should compute with one thread."""
 
     def __init__(self, num: int) -> None:
-        self._num = num
+        self.num = num
         self._threads = (
             ThreadPoolExecutor(num - 1, "slice", partial(torch.set_num_threads, 1))
             if num > 1
@@ -28,7 +28,7 @@ class Slices:
 
     def map(self, work: Callable[[slice], T], size: int) -> list[T]:
         """What the work gives for each slice of `size` rows; raises what it raises."""
-        num = min(self._num, size)
+        num = min(self.num, size)
         first, *others = (slice(i * size // num, (i + 1) * size // num) for i in range(num))
         if self._threads is None:
             return [work(first)]

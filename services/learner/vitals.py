@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.config import Config
+from common.network import Trace
 from common.trajectory import Float32Array
 from services.learner.batch import Batch
 from services.learner.learner import Learner
@@ -91,10 +92,10 @@ class Vitals:
         Of a convolution the units are its channels.
         """
         network = self._learner.online
-        seen: list[Tensor] = []
+        trace = Trace()
         with torch.no_grad():
-            q = network.evaluate(network.prepare(states), network.operands(), seen)
-        dead = torch.cat([x.transpose(0, 1).flatten(1).amax(1) <= 0 for x in seen])
+            q = network.evaluate(network.prepare(states), network.operands(), trace)
+        dead = torch.cat([x.transpose(0, 1).flatten(1).amax(1) <= 0 for x in trace.units])
         return q, dead.float().mean()
 
     def _drift(self) -> Tensor:
