@@ -187,16 +187,20 @@ class ReplayService:
                 request.refuse(str(error))
 
     def _insert(self, request: _Request) -> None:
+        """One thread inserts, so that what it found stays so while it lets the lock go."""
         messages = split_set(request.payload)
         chunks = [self._checked(message) for message in messages]
-        with self._changed:
-            for message, chunk in zip(messages, chunks, strict=True):
-                arrival = self._classify(chunk)
-                if not (arrival is Arrival.REPEATED or self._admitted(request, message, chunk)):
+        for message, chunk in zip(messages, chunks, strict=True):
+            arrival = self._classify(chunk)
+            if arrival is not Arrival.REPEATED:
+                if not self._admitted(request, chunk):
                     return
+                if not self._logged(request, message, chunk):
+                    return
+            with self._changed:
                 self._store(chunk, arrival)
                 self._changed.notify_all()
-            total = self._table.next_key
+        total = self._table.next_key
         request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
 
     def _checked(self, message: Part) -> Chunk:
@@ -209,11 +213,16 @@ class ReplayService:
             )
         return chunk
 
-    def _admitted(self, request: _Request, message: Part, chunk: Chunk) -> bool:
-        """Whether the chunk may enter the table and is in the log; else the request is held."""
-        if not self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
-            request.hold("the learner has not sampled enough of what is there yet")
-            return False
+    def _admitted(self, request: _Request, chunk: Chunk) -> bool:
+        """Whether the rate limiter lets the chunk in; else the request is held."""
+        with self._changed:
+            if self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
+                return True
+        request.hold("the learner has not sampled enough of what is there yet")
+        return False
+
+    def _logged(self, request: _Request, message: Part, chunk: Chunk) -> bool:
+        """Whether the chunk is in the log; else the request is held. Samples go on meanwhile."""
         try:
             if self._log is not None:
                 self._log.append(message, self._table.next_key, len(chunk))
