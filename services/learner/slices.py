@@ -1,7 +1,7 @@
-"""A batch cut into slices, each worked on by a thread of its own.
+"""Work cut into slices, each done by a thread of its own: rows of a batch, units, parameters.
 
 Invariants: results come in the order of the slices; the calling thread takes the first of them;
-threads meet once a batch. Inside an operation they would meet at every layer, and each time wait
+threads meet once a map. Inside an operation they would meet at every layer, and each time wait
 for the one that another process keeps from its core.
 """
 
