@@ -78,7 +78,7 @@ class Descent:
         """
         self._add_up(parts)
         products = {
-            name: [torch.cat(x) for x in zip(*(part.products[name] for part in parts), strict=True)]
+            name: [_joined(x) for x in zip(*(part.products[name] for part in parts), strict=True)]
             for name in self._network.hidden_weights
         }
 
@@ -132,6 +132,10 @@ class Descent:
                     optimizer.state[parameter] = {
                         moment: moments[f"{of[parameter]}:{moment}"] for moment in names
                     }
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def _product(left: Tensor, right: Tensor, out: Tensor) -> None:
