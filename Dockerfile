@@ -72,7 +72,7 @@ COPY --from=learning-installed /opt/mrcdrl /opt/mrcdrl
 # Compiled functions are kept here. Freed memory stays with the process, as with `mrcdrl train`.
 ENV NUMBA_CACHE_DIR=/var/cache/mrcdrl \
     MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4294967296 MALLOC_TOP_PAD_=67108864
-RUN python -m common.arena
+RUN python -m common.precompile
 
 # -- one target a service -----------------------------------------------------------------------------
 

@@ -34,6 +34,7 @@ PLACES = {
         "common/first_layer.py",
         "common/network.py",
         "common/policy.py",
+        "common/precompile.py",
         "services/learner",
         "services/actor",
         "services/evaluator",

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+BASE = REPOSITORY / "docker-compose.yml"
 SMOKE = Path(__file__).with_name("smoke.yml")
 ENGINE_VARIABLE = "MRCDRL_DOCKER_ENGINE"  # a script that brings an engine up and down
 WHEELS_VARIABLE = "PIP_FIND_LINKS"
@@ -84,14 +85,13 @@ class Container:
 
 
 class Stack:
-    """`docker compose …` with the smoke override, under a project name of its own."""
+    """`docker compose …` with these overrides, under a project name of its own."""
 
-    def __init__(self, environment: Mapping[str, str], folder: Path) -> None:
+    def __init__(self, environment: Mapping[str, str], *overrides: Path) -> None:
         self.project = f"mrcdrl-test-{uuid.uuid4().hex[:8]}"
         self._environment = dict(environment)
-        files = [REPOSITORY / "docker-compose.yml", SMOKE, wheels_override(environment, folder)]
         self._head = ["docker", "compose", "--project-name", self.project]
-        self._head += [word for file in files for word in ("--file", str(file))]
+        self._head += [word for file in (BASE, *overrides) for word in ("--file", str(file))]
 
     def compose(self, *arguments: str, timeout_s: float = 120.0) -> str:
         """Its output; fails with all it said."""
@@ -120,6 +120,15 @@ class Stack:
         """To the service's process, not to the container: `docker kill` would count as a stop."""
         command = f"kill -{name} $(cut -d' ' -f1 /tmp/heartbeat)"
         self.docker("exec", container.id, "sh", "-c", command)
+
+    def log(self, service: str) -> str:
+        return self.compose("logs", "--no-color", service)
+
+    def config(self) -> dict[str, Any]:
+        """The services as Compose reads the files; needs no engine."""
+        said = json.loads(self.compose("config", "--format", "json"))
+        services: dict[str, Any] = said["services"]
+        return services
 
     def status(self) -> dict[str, Any]:
         """What `mrcdrl status --json` says now."""

@@ -1,42 +1,92 @@
 """`docker compose up` on a real engine: healthy, training, scaled, through faults, stopped.
 
-One stack for all tests, in their order; without an engine they are skipped, and say so.
+Two stacks, one after the other, each for all its tests in their order: the plain one, and one that
+is secured and has two shards. Without an engine they are skipped, and say so.
 """
 
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.compose.compose_stack import Container, NoEngineError, Stack, engine
+from tests.compose.compose_stack import (
+    REPOSITORY,
+    SMOKE,
+    Container,
+    NoEngineError,
+    Stack,
+    engine,
+    wheels_override,
+)
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 SERVICES = ("router", "replay", "learner", "actor", "evaluator", "status")
 UP_S = 180.0  # 60 on a machine that does nothing else
 AGAIN_S = 120.0  # from a fault to the next
+SECURE, SHARDS, GPU, ZENOHD = (
+    REPOSITORY / f"compose.{name}.yml" for name in ("secure", "shards", "gpu", "zenohd")
+)
+SECURED = Path(__file__).with_name("secured.yml")
+INTRUDER = Path(__file__).with_name("intruder.py")
+REFUSED = {  # what the router's log says of each of the intruder's attempts
+    "without_a_certificate": "refused a connection: peer sent no certificates",
+    "with_a_foreign_authority": "refused a connection: invalid peer certificate",
+    "in_no_role": "its certificate has no role here",
+    "weights_as_an_actor": "refused actor: Put on mrcdrl/stack/weights",
+    "samples_as_an_evaluator": "refused evaluator: Query on mrcdrl/stack/replay/1/sample",
+}
 
 
 @pytest.fixture(scope="module")
-def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    """The stack with its images built, not up yet; removed at the end."""
-    folder = tmp_path_factory.mktemp("compose")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """In which there is an engine; brought up for these tests, if one can be had."""
     with ExitStack() as cleanup:
         try:
-            environment = cleanup.enter_context(engine(folder))
+            found = cleanup.enter_context(engine(tmp_path_factory.mktemp("engine")))
         except NoEngineError as error:
             pytest.skip(f"NO DOCKER ENGINE: THE STACK IS NOT TESTED ({error})")
-        stack = Stack(environment, folder)
-        stack.compose("build", timeout_s=1500)
-        cleanup.callback(stack.remove)
-        yield stack
+        yield found
+
+
+@pytest.fixture(scope="module")
+def built(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The same, with the images of both stacks."""
+    wheels = wheels_override(environment, tmp_path_factory.mktemp("compose"))
+    Stack(environment, SECURE, wheels).compose("build", timeout_s=1500)
+    return environment
+
+
+@pytest.fixture(scope="module")
+def stack(built: dict[str, str]) -> Iterator[Stack]:
+    """The plain stack, not up yet; removed at the end."""
+    stack = Stack(built, SMOKE)
+    yield stack
+    stack.remove()
+
+
+@pytest.fixture(scope="module")
+def secured(built: dict[str, str]) -> Iterator[Stack]:
+    """Another: encrypted, each service in its role, with two shards."""
+    secured = Stack(built, SMOKE, SHARDS, SECURE, SECURED)
+    yield secured
+    secured.remove()
 
 
 def records(stack: Stack, name: str) -> list[dict[str, Any]]:
     """Lines of a file that the status service keeps."""
     text = stack.compose("exec", "--no-TTY", "status", "cat", f"/runs/stack/{name}.jsonl")
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def come_up(stack: Stack, services: tuple[str, ...]) -> None:
+    """One healthy container of each; `--wait` alone does not say for how long."""
+    stack.compose("up", "--detach", "--wait", "--no-build", timeout_s=UP_S)
+    for service in services:
+        assert len(stack.containers(service)) == 1
+        stack.eventually(lambda s=service: healthy(stack, s), f"{service} is healthy", AGAIN_S)
 
 
 def healthy(stack: Stack, service: str) -> bool:
@@ -50,10 +100,7 @@ def restarted(stack: Stack, before: Container) -> bool:
 
 @pytest.mark.timeout(3000)  # an engine and images may have to be made first
 def test_it_comes_up_healthy(stack: Stack) -> None:
-    stack.compose("up", "--detach", "--wait", timeout_s=UP_S)
-    for service in SERVICES:
-        assert len(stack.containers(service)) == 1
-        assert healthy(stack, service), service
+    come_up(stack, SERVICES)
 
 
 @pytest.mark.parametrize("service", SERVICES)
@@ -91,7 +138,9 @@ def test_more_actors_join(stack: Stack) -> None:
         actors = [s["id"] for s in said["services"] if s["role"] == "actor" and s["alive"]]
         return {a for a in actors if said.get(f"actor/{a}/inserts_acknowledged", 0) > 0}
 
-    stack.compose("up", "--detach", "--no-recreate", "--scale", "actor=3", timeout_s=UP_S)
+    stack.compose(
+        "up", "--detach", "--no-build", "--no-recreate", "--scale", "actor=3", timeout_s=UP_S
+    )
     assert len(stack.containers("actor")) == 3
     stack.eventually(lambda: len(at_work()) == 3, "three actors' transitions in replay", AGAIN_S)
     for service in SERVICES:
@@ -124,3 +173,73 @@ def test_it_stops_in_order_and_leaves_nothing(stack: Stack) -> None:
     assert codes == {service: [0] * (3 if service == "actor" else 1) for service in SERVICES}
     stack.remove()
     assert stack.left() == []
+
+
+@pytest.mark.timeout(3000)  # as above, where it is asked for alone
+def test_it_comes_up_secured_and_sharded(secured: Stack) -> None:
+    come_up(secured, (*SERVICES, "replay-1", "actor-1"))
+
+
+def test_it_learns_from_both_shards_and_refuses_none_of_its_own(secured: Stack) -> None:
+    counted = [
+        f"replay/replay-{shard}/{what}" for shard in (0, 1) for what in ("inserts", "samples")
+    ]
+    first = secured.status()
+
+    def advances() -> bool:
+        now = secured.status()
+        return all(now.get(name, 0) > first.get(name, 0) for name in (*counted, "learner_steps"))
+
+    secured.eventually(advances, "steps, and inserts and samples of both shards", AGAIN_S)
+    assert "refused" not in secured.log("router")
+
+
+@pytest.mark.parametrize("attempt", REFUSED)
+def test_who_may_not_is_refused(secured: Stack, attempt: str) -> None:
+    secured.compose(
+        *("run", "--rm", "--no-deps", "--no-TTY", "intruder"), "-c", INTRUDER.read_text(), attempt
+    )
+    said = REFUSED[attempt]
+    secured.eventually(lambda: said in secured.log("router"), f"the log says {said!r}", AGAIN_S)
+
+
+def test_it_learns_on_and_leaves_nothing(secured: Stack) -> None:
+    steps = secured.status()["learner_steps"]
+    secured.eventually(
+        lambda: secured.status()["learner_steps"] > steps, "steps after all that", AGAIN_S
+    )
+    secured.remove()
+    assert secured.left() == []
+
+
+def test_the_learner_reserves_a_gpu(environment: dict[str, str]) -> None:
+    """Not more than that: there is none to run it on."""
+    plain, changed = Stack(environment).config(), Stack(environment, GPU).config()
+    device = {"driver": "nvidia", "count": 1, "capabilities": ["gpu"]}
+    learner = changed.pop("learner")
+    assert learner["deploy"]["resources"]["reservations"].pop("devices") == [device]
+    assert learner | {"deploy": None} == plain.pop("learner") | {"deploy": None}
+    assert changed == plain
+
+
+def test_zenohd_is_the_router_by_the_same_file(environment: dict[str, str]) -> None:
+    """Not more than that: its image is not run."""
+    plain, changed = Stack(environment).config(), Stack(environment, ZENOHD).config()
+    router = changed.pop("router")
+    (version,) = (
+        line.removeprefix("eclipse-zenoh==")
+        for line in (REPOSITORY / "constraints.txt").read_text("utf-8").splitlines()
+        if line.startswith("eclipse-zenoh==")
+    )
+    assert router["image"] == f"eclipse/zenoh:{version}"
+    assert "build" not in router
+    assert router["command"][:4] == ["--config", "/router.json5", "--listen", "tcp/0.0.0.0:7447"]
+    (mount,) = router["volumes"]
+    assert mount["source"] == str(REPOSITORY / "configs" / "router.json5")
+    assert mount["target"] == "/router.json5"
+    assert mount["read_only"]
+    assert "7447" in router["healthcheck"]["test"][-1]
+    kept = ("read_only", "cap_drop", "security_opt", "init", "restart")
+    assert {k: router[k] for k in kept} == {k: plain["router"][k] for k in kept}
+    del plain["router"]
+    assert changed == plain
