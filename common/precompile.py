@@ -24,7 +24,7 @@ def main() -> None:
     codec.decode(steps.records.reshape(arena.num_robots, -1))
 
     network = QNetwork(config.agent.kind, stack=arena.stack, view_px=arena.view_px)
-    windows = torch.zeros(1, arena.stack + 1, arena.view_px, arena.view_px, dtype=torch.uint8)
+    windows = torch.zeros(2, arena.stack + 1, arena.view_px, arena.view_px, dtype=torch.uint8)
     for states in (windows[:, : arena.stack].contiguous(), windows[:, : arena.stack]):
         values = network.evaluate(network.prepare(states), network.operands())
         values.sum().backward()  # type: ignore[no-untyped-call]

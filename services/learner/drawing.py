@@ -35,7 +35,7 @@ from common.trajectory import Int64Array, UInt8Array
 Turns = Sequence[tuple[Symmetry, Int64Array]]
 """Symmetries, each with the rows of the batch it was drawn for."""
 
-_BLOCK_PICTURES = 256  # that a thread draws at a time, some 0.7 ms; so few are not worth a second
+_BLOCK_PICTURES = 256  # that a thread draws at a time, some 0.5 ms; so few are not worth a second
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)  # scan lines a row, as on the host
 
