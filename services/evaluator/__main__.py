@@ -41,12 +41,12 @@ def main(argv: Sequence[str]) -> int:
     """Judge for a run; the exit code."""
     joining = joining_arguments("evaluator", argv)
     stop = StopSignal().listen(STOP_DEADLINE_S)
-    os.nice(_NICE)
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)
         torch.set_num_threads(config.evaluator.threads)
         evaluator = Evaluator(config, joining, session, stop)
         session.announce(joining.keys.live("evaluator", joining.worker))
+        os.nice(_NICE)  # not sooner: whoever starts it again waits for it
         evaluator.run()
     return 0
 
