@@ -20,7 +20,8 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
 
 def last_metrics(run: Path) -> dict[str, float]:
-    lines = (run / "metrics.jsonl").read_text("utf-8").splitlines() if run.exists() else []
+    path = run / "metrics.jsonl"
+    lines = path.read_text("utf-8").splitlines() if path.exists() else []
     found: dict[str, float] = json.loads(lines[-1]) if lines else {}
     return found
 
