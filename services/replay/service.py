@@ -28,6 +28,7 @@ from services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
 _TAKE_S = 0.2  # how soon a thread sees that it is to stop
+_GROUP = 16  # requests to insert that may share one hold of the lock
 _COUNTS = (
     *("chunks", "duplicates", "gaps", "refused", "log_errors"),
     *("priority_updates", "priorities_ignored"),
@@ -78,6 +79,8 @@ class ReplayService:
         )
         self._turns = Turns.of(config)
         self._book = SequenceBook()
+        self._logged: list[tuple[Chunk, Arrival]] = []  # and not in the table yet
+        self._owed: list[tuple[_Request, InsertReply]] = []  # once they are
         self._earlier = {"inserts": 0, "samples": 0}  # that the limiter does not count
         self._changed = threading.Condition()
         self._log_fails = False
@@ -86,7 +89,7 @@ class ReplayService:
         self._held = {"insert_held": False, "sample_held": False}
         self._servers = (inserts, samples, priorities)
         self._threads = [
-            threading.Thread(target=self._serve, args=(inserts, self._insert), name="insert"),
+            threading.Thread(target=self._serve_inserts, args=(inserts,), name="insert"),
             threading.Thread(target=self._serve, args=(samples, self._sample), name="sample"),
             threading.Thread(
                 target=self._serve, args=(priorities, self._prioritize), name="priorities"
@@ -102,7 +105,10 @@ class ReplayService:
         for payload in self._log.recover(lambda: self._table.next_key):
             try:
                 chunk = decode(Chunk, payload)
-                self._store(chunk, self._classify(chunk))
+                arrival = self._classify(chunk)
+                if arrival is not Arrival.REPEATED:
+                    self._remember(chunk)
+                    self._store(chunk, arrival)
             except WireError as error:
                 self._counts["refused"] += 1
                 left_out = str(error)
@@ -177,31 +183,58 @@ class ReplayService:
     def _serve(self, server: _Server, answer: Callable[[_Request], None]) -> None:
         while not self._stopping.is_set():
             request = server.take(_TAKE_S)
-            if request is None:
-                continue
-            try:
-                answer(request)
-            except WireError as error:
-                with self._changed:
-                    self._counts["refused"] += 1
-                request.refuse(str(error))
+            if request is not None:
+                self._answer(request, answer)
+
+    def _serve_inserts(self, server: _Server) -> None:
+        """What waits already is stored together: each hold of the lock waits for a whole sample."""
+        while not self._stopping.is_set():
+            for count in range(_GROUP):
+                request = server.take(0.0 if count else _TAKE_S)
+                if request is None:
+                    break
+                self._answer(request, self._insert)
+            self._store_logged()
+
+    def _answer(self, request: _Request, answer: Callable[[_Request], None]) -> None:
+        try:
+            answer(request)
+        except WireError as error:
+            with self._changed:
+                self._counts["refused"] += 1
+            request.refuse(str(error))
 
     def _insert(self, request: _Request) -> None:
-        """One thread inserts, so that what it found stays so while it lets the lock go."""
+        """Log the chunks of a request; they are stored, and it is answered, by `_store_logged`.
+
+        One thread inserts, so that what it found stays so while it does not hold the lock.
+        """
         messages = split_set(request.payload)
         chunks = [self._checked(message) for message in messages]
         for message, chunk in zip(messages, chunks, strict=True):
             arrival = self._classify(chunk)
-            if arrival is not Arrival.REPEATED:
-                if not self._admitted(request, chunk):
-                    return
-                if not self._logged(request, message, chunk):
-                    return
+            if arrival is Arrival.REPEATED:
+                self._counts["duplicates"] += 1
+            elif self._admitted(request, chunk) and self._appended(request, message, chunk):
+                self._remember(chunk)
+                self._logged.append((chunk, arrival))
+            else:
+                return
+        reply = InsertReply(chunk.sequence, arrival is Arrival.REPEATED, self._next_key)
+        self._owed.append((request, reply))
+
+    def _store_logged(self) -> None:
+        """Put what is logged into the table, and acknowledge it."""
+        if self._logged:
             with self._changed:
-                self._store(chunk, arrival)
+                for chunk, arrival in self._logged:
+                    self._store(chunk, arrival)
                 self._changed.notify_all()
-        total = self._table.next_key
-        request.reply(encode(InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)))
+            self._logged.clear()
+            self._forget()
+        for request, reply in self._owed:
+            request.reply(encode(reply))
+        self._owed.clear()
 
     def _checked(self, message: Part) -> Chunk:
         chunk = decode(Chunk, message)
@@ -215,17 +248,21 @@ class ReplayService:
 
     def _admitted(self, request: _Request, chunk: Chunk) -> bool:
         """Whether the rate limiter lets the chunk in; else the request is held."""
+        if self._limiter.can_insert(self._num_logged + len(chunk)):  # and samples only allow more
+            self._held["insert_held"] = False
+            return True
+        self._store_logged()
         with self._changed:
             if self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
                 return True
         request.hold("the learner has not sampled enough of what is there yet")
         return False
 
-    def _logged(self, request: _Request, message: Part, chunk: Chunk) -> bool:
+    def _appended(self, request: _Request, message: Part, chunk: Chunk) -> bool:
         """Whether the chunk is in the log; else the request is held. Samples go on meanwhile."""
         try:
             if self._log is not None:
-                self._log.append(message, self._table.next_key, len(chunk))
+                self._log.append(message, self._next_key, len(chunk))
         except OSError as error:
             self._log_fails = True
             self._counts["log_errors"] += 1
@@ -234,19 +271,27 @@ class ReplayService:
             request.hold(f"replay's log cannot be written: {reason(error)}")
             return False
         self._log_fails = False
-        self._forget()
         return True
+
+    @property
+    def _num_logged(self) -> int:
+        """Transitions that are in the log, and not in the table yet."""
+        return sum(len(chunk) for chunk, _ in self._logged)
+
+    @property
+    def _next_key(self) -> int:
+        """Of the transition that is logged next."""
+        return self._table.next_key + self._num_logged
 
     def _classify(self, chunk: Chunk) -> Arrival:
         return self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
 
-    def _store(self, chunk: Chunk, arrival: Arrival) -> None:
-        """Put a chunk into the table, unless it was here before; count it."""
-        if arrival is Arrival.REPEATED:
-            self._counts["duplicates"] += 1
-            return
-        self._table.insert(chunk)
+    def _remember(self, chunk: Chunk) -> None:
         self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
+
+    def _store(self, chunk: Chunk, arrival: Arrival) -> None:
+        """Put a chunk into the table; count it."""
+        self._table.insert(chunk)
         self._limiter.inserts += len(chunk)
         self._counts["chunks"] += 1
         self._counts["gaps"] += arrival is Arrival.GAP

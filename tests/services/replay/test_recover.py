@@ -83,6 +83,7 @@ def insert(service: ReplayService, *chunks: Chunk) -> list[str]:
     requests = [Answered(encode(c)) for c in chunks]
     for request in requests:
         service._insert(request)
+        service._store_logged()
     return [answer for request in requests for answer in request.answers]
 
 
@@ -140,20 +141,37 @@ def test_chunks_of_another_agent_are_left_out_and_new_ones_taken(
     assert again._limiter.can_sample(32)
 
 
+def full(*_: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+FULL = "held: replay's log cannot be written: No space left on device"
+
+
 def test_a_full_disk_holds_inserts_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service = start(tmp_path)
     insert(service, chunk(0))
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    log = service._log
-    assert log is not None
-    monkeypatch.setattr(log, "append", full)
-    (answer,) = insert(service, chunk(1))
-    assert answer == "held: replay's log cannot be written: No space left on device"
+    monkeypatch.setattr(service._log, "append", full)
+    assert insert(service, chunk(1)) == [FULL]
     monkeypatch.undo()
     assert insert(service, chunk(1)) == ["reply"]
+    assert start(tmp_path).metrics()["size"] == 32
+
+
+def test_what_was_logged_before_the_disk_was_full_is_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = start(tmp_path)
+    logged, held = (Answered(encode(chunk(n))) for n in range(2))
+    service._insert(logged)
+    monkeypatch.setattr(service._log, "append", full)
+    service._insert(held)
+    service._store_logged()
+    assert logged.answers == ["reply"]
+    assert held.answers == [FULL]
+    monkeypatch.undo()
+    assert insert(service, chunk(1)) == ["reply"]
+    assert service.metrics()["duplicates"] == 0
     assert start(tmp_path).metrics()["size"] == 32

@@ -223,6 +223,29 @@ def test_of_chunks_that_come_together_those_before_one_that_is_held_are_stored()
         assert inserted(up.insert(set_bytes(0, 1, 2, 3, 4))) == InsertReply(4, False, 5 * LENGTH)
 
 
+def test_requests_that_wait_are_stored_together_and_answered_each() -> None:
+    with replay() as up:
+        with up.service._changed:  # a sample that takes long
+            requests = [
+                up.inserts.put(WatchfulRequest(payload, table=up.table))
+                for payload in (*map(chunk_bytes, (0, 1)), b"\x00", *map(chunk_bytes, (1, 3)))
+            ]
+        answers = [request.answer() for request in requests]
+        assert answers.pop(2)[0] == "refuse"
+        assert list(map(inserted, answers)) == [
+            InsertReply(0, False, LENGTH),
+            InsertReply(1, False, 2 * LENGTH),
+            InsertReply(1, True, 2 * LENGTH),
+            InsertReply(3, False, 3 * LENGTH),
+        ]
+        stored = [request.stored_when_acknowledged for request in requests]
+        assert stored[0] >= LENGTH
+        assert min(stored[1], stored[3]) >= 2 * LENGTH
+        assert stored[4] == 3 * LENGTH
+        metrics = up.service.metrics()
+        assert (metrics["chunks"], metrics["duplicates"], metrics["gaps"]) == (3, 1, 1)
+
+
 REFUSED = {
     "no message": (b"\x00\x01", "no msgpack|not a map"),
     "another message": (encode(Stats("a", "b", {})), "'stats/1' where 'chunk/1'"),

@@ -65,6 +65,7 @@ def insert(service: ReplayService, *chunks: Chunk) -> None:
     for each in chunks:
         request = Answered(encode(each))
         service._insert(request)
+        service._store_logged()
         assert request.answers == ["reply"]
 
 
