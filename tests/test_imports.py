@@ -21,6 +21,7 @@ PLACES = {
     "zenoh": ("common/transport",),
     "lz4": ("common/transport",),
     "msgpack": ("common/wire.py",),
+    "zlib_ng": ("services/replay/log.py",),
     "pymunk": ("common/arena",),
     "cv2": ("common/arena",),
     "numba": ("common/arena", "common/lit_kernels.py"),

@@ -2,6 +2,8 @@
 
 import errno
 import os
+import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,6 +47,13 @@ def test_what_was_appended_comes_back_in_order(tmp_path: Path) -> None:
     write(tmp_path, PAYLOADS)
     assert len(segments(tmp_path)) > 1
     assert recover(open_log(tmp_path)) == PAYLOADS
+
+
+def test_a_record_is_a_length_a_crc_32_and_the_payload(tmp_path: Path) -> None:
+    write(tmp_path, PAYLOADS[:1])
+    (segment,) = segments(tmp_path)
+    head = struct.pack("<II", 40, zlib.crc32(PAYLOADS[0]))
+    assert segment.read_bytes() == head + PAYLOADS[0]
 
 
 def test_a_reopened_log_goes_on(tmp_path: Path) -> None:
