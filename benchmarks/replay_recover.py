@@ -85,7 +85,7 @@ def fill(config: Config, directory: Path) -> None:
             bootstrap_offsets=np.full(length, config.agent.n_step, np.uint8),
             priorities=rng.random(length, np.float32) if config.replay.prioritized else NONE,
         )
-        log.append(encode(chunk), number * length, length)
+        log.append([encode(chunk)], number * length, length)
     log.close()
     (directory / "snapshot").write_bytes(started(config, directory).snapshot().to_bytes())
 

@@ -29,9 +29,18 @@ class SequenceBook:
             return Arrival.REPEATED
         return Arrival.NEXT if sequence == last + 1 else Arrival.GAP
 
-    def record(self, actor: str, incarnation: int, sequence: int) -> None:
-        """Remember that the chunk is stored."""
+    def record(self, actor: str, incarnation: int, sequence: int) -> int | None:
+        """Remember that the chunk is stored; the sequence number that was the last before."""
+        before = self._last.get((actor, incarnation))
         self._last[actor, incarnation] = sequence
         self._last.move_to_end((actor, incarnation))
         while len(self._last) > self._max_streams:
             self._last.popitem(last=False)
+        return before
+
+    def take_back(self, actor: str, incarnation: int, before: int | None) -> None:
+        """The chunk recorded last of the stream is not stored after all; `before`: of `record`."""
+        if before is None:
+            self._last.pop((actor, incarnation), None)
+        else:
+            self._last[actor, incarnation] = before

@@ -9,6 +9,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -49,6 +50,16 @@ class _Request(Protocol):
     def hold(self, reason: str) -> None: ...
 
 
+@dataclass(frozen=True, slots=True)
+class _Accepted:
+    """A chunk that is to be logged and stored."""
+
+    message: Part
+    chunk: Chunk
+    arrival: Arrival
+    before: int | None  # the sequence number of its stream's last
+
+
 class _Server(Protocol):
     refused: int  # that were too large to be taken
 
@@ -79,8 +90,8 @@ class ReplayService:
         )
         self._turns = Turns.of(config)
         self._book = SequenceBook()
-        self._logged: list[tuple[Chunk, Arrival]] = []  # and not in the table yet
-        self._owed: list[tuple[_Request, InsertReply]] = []  # once they are
+        self._accepted: list[_Accepted] = []  # neither logged nor stored yet
+        self._owed: list[tuple[_Request, InsertReply]] = []  # once all of them are
         self._earlier = {"inserts": 0, "samples": 0}  # that the limiter does not count
         self._changed = threading.Condition()
         self._log_fails = False
@@ -107,7 +118,7 @@ class ReplayService:
                 chunk = decode(Chunk, payload)
                 arrival = self._classify(chunk)
                 if arrival is not Arrival.REPEATED:
-                    self._remember(chunk)
+                    self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
                     self._store(chunk, arrival)
             except WireError as error:
                 self._counts["refused"] += 1
@@ -187,14 +198,17 @@ class ReplayService:
                 self._answer(request, answer)
 
     def _serve_inserts(self, server: _Server) -> None:
-        """What waits already is stored together: each hold of the lock waits for a whole sample."""
+        """What waits already is written and stored together.
+
+        To write costs a wait for this process's turn in Python, to store one for a whole sample.
+        """
         while not self._stopping.is_set():
             for count in range(_GROUP):
                 request = server.take(0.0 if count else _TAKE_S)
                 if request is None:
                     break
                 self._answer(request, self._insert)
-            self._store_logged()
+            self._commit()
 
     def _answer(self, request: _Request, answer: Callable[[_Request], None]) -> None:
         try:
@@ -205,7 +219,7 @@ class ReplayService:
             request.refuse(str(error))
 
     def _insert(self, request: _Request) -> None:
-        """Log the chunks of a request; they are stored, and it is answered, by `_store_logged`.
+        """Accept the chunks of a request; `_commit` answers it, unless it is held here.
 
         One thread inserts, so that what it found stays so while it does not hold the lock.
         """
@@ -215,26 +229,54 @@ class ReplayService:
             arrival = self._classify(chunk)
             if arrival is Arrival.REPEATED:
                 self._counts["duplicates"] += 1
-            elif self._admitted(request, chunk) and self._appended(request, message, chunk):
-                self._remember(chunk)
-                self._logged.append((chunk, arrival))
-            else:
+                continue
+            why_not = self._why_not_admitted(request, chunk)
+            if why_not:
+                request.hold(why_not)
                 return
-        reply = InsertReply(chunk.sequence, arrival is Arrival.REPEATED, self._next_key)
+            before = self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
+            self._accepted.append(_Accepted(message, chunk, arrival, before))
+        total = self._table.next_key + self._num_accepted
+        reply = InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)
         self._owed.append((request, reply))
 
-    def _store_logged(self) -> None:
-        """Put what is logged into the table, and acknowledge it."""
-        if self._logged:
+    def _commit(self) -> str:
+        """Log what is accepted, store it, and answer; else why all of it is held."""
+        accepted, owed = self._accepted, self._owed
+        self._accepted, self._owed = [], []
+        why_not = self._append(accepted)
+        if why_not:
+            for each in reversed(accepted):
+                self._book.take_back(each.chunk.actor, each.chunk.incarnation, each.before)
+            for request, _ in owed:
+                request.hold(why_not)
+            return why_not
+        if accepted:
             with self._changed:
-                for chunk, arrival in self._logged:
-                    self._store(chunk, arrival)
+                for each in accepted:
+                    self._store(each.chunk, each.arrival)
                 self._changed.notify_all()
-            self._logged.clear()
             self._forget()
-        for request, reply in self._owed:
+        for request, reply in owed:
             request.reply(encode(reply))
-        self._owed.clear()
+        return ""
+
+    def _append(self, accepted: Sequence[_Accepted]) -> str:
+        """Write to the log, if there is one, while samples go on; else why that cannot be."""
+        if self._log is None or not accepted:
+            return ""
+        messages = [each.message for each in accepted]
+        count = sum(len(each.chunk) for each in accepted)
+        try:
+            self._log.append(messages, self._table.next_key, count)
+        except OSError as error:
+            self._log_fails = True
+            self._counts["log_errors"] += 1
+            if self._counts["log_errors"] == 1:
+                _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
+            return f"replay's log cannot be written: {reason(error)}"
+        self._log_fails = False
+        return ""
 
     def _checked(self, message: Part) -> Chunk:
         chunk = decode(Chunk, message)
@@ -246,48 +288,26 @@ class ReplayService:
             )
         return chunk
 
-    def _admitted(self, request: _Request, chunk: Chunk) -> bool:
-        """Whether the rate limiter lets the chunk in; else the request is held."""
-        if self._limiter.can_insert(self._num_logged + len(chunk)):  # and samples only allow more
+    def _why_not_admitted(self, request: _Request, chunk: Chunk) -> str:
+        """Why the rate limiter does not let the chunk in for now; empty where it does."""
+        if self._limiter.can_insert(self._num_accepted + len(chunk)):  # samples only allow more
             self._held["insert_held"] = False
-            return True
-        self._store_logged()
+            return ""
+        why_not = self._commit()
+        if why_not:
+            return why_not
         with self._changed:
             if self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
-                return True
-        request.hold("the learner has not sampled enough of what is there yet")
-        return False
-
-    def _appended(self, request: _Request, message: Part, chunk: Chunk) -> bool:
-        """Whether the chunk is in the log; else the request is held. Samples go on meanwhile."""
-        try:
-            if self._log is not None:
-                self._log.append(message, self._next_key, len(chunk))
-        except OSError as error:
-            self._log_fails = True
-            self._counts["log_errors"] += 1
-            if self._counts["log_errors"] == 1:
-                _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
-            request.hold(f"replay's log cannot be written: {reason(error)}")
-            return False
-        self._log_fails = False
-        return True
+                return ""
+        return "the learner has not sampled enough of what is there yet"
 
     @property
-    def _num_logged(self) -> int:
-        """Transitions that are in the log, and not in the table yet."""
-        return sum(len(chunk) for chunk, _ in self._logged)
-
-    @property
-    def _next_key(self) -> int:
-        """Of the transition that is logged next."""
-        return self._table.next_key + self._num_logged
+    def _num_accepted(self) -> int:
+        """Transitions that are not in the table yet."""
+        return sum(len(each.chunk) for each in self._accepted)
 
     def _classify(self, chunk: Chunk) -> Arrival:
         return self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
-
-    def _remember(self, chunk: Chunk) -> None:
-        self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
 
     def _store(self, chunk: Chunk, arrival: Arrival) -> None:
         """Put a chunk into the table; count it."""

@@ -50,7 +50,7 @@ def test_the_ordeal_would_notice(tmp_path: Path, name: str) -> None:
     log = SegmentLog(tmp_path / "0", segment_bytes=10**9, fsync=False)
     for place, number in enumerate(order):
         chunk = counting_chunk(config, WRITERS[number % 2], 1, number // 2)
-        log.append(encode(chunk), place * length, length)
+        log.append([encode(chunk)], place * length, length)
     log.close()
     contents = read_contents(tmp_path / "0", config, records=True)
     found = compare(config, contents, tmp_path)

@@ -172,9 +172,9 @@ def test_damage_is_told_and_nothing_is_changed(
     for _ in log.recover(lambda: 0):
         pass
     stranger = chunk(9)
-    log.append(encode(stranger)[:-1], 10**6, 1)
-    log.append(encode(CHUNKS[3]), 10**6, 1)
-    log.append(encode(CHUNKS[0]).replace(b"chunk/1", b"chunk/7"), 10**6, 1)
+    log.append([encode(stranger)[:-1]], 10**6, 1)
+    log.append([encode(CHUNKS[3])], 10**6, 1)
+    log.append([encode(CHUNKS[0]).replace(b"chunk/1", b"chunk/7")], 10**6, 1)
     log.close()
     segments = sorted(directory.glob("*.segment"))
     with segments[-1].open("ab") as file:

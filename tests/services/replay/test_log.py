@@ -32,7 +32,7 @@ def write(directory: Path, payloads: Sequence[bytes], first_key: int = 0) -> Non
     log = open_log(directory)
     recover(log)
     for number, payload in enumerate(payloads):
-        log.append(payload, first_key + 10 * number, 10)
+        log.append([payload], first_key + 10 * number, 10)
     log.close()
 
 
@@ -56,6 +56,13 @@ def test_a_record_is_a_length_a_crc_32_and_the_payload(tmp_path: Path) -> None:
     assert segment.read_bytes() == head + PAYLOADS[0]
 
 
+def test_any_number_of_records_is_appended_at_once(tmp_path: Path) -> None:
+    payloads = [n.to_bytes(2, "big") for n in range(1500)]  # of two parts each: more than a call's
+    log = open_log(tmp_path)
+    log.append(payloads, 0, 10 * len(payloads))
+    assert recover(open_log(tmp_path)) == payloads
+
+
 def test_a_reopened_log_goes_on(tmp_path: Path) -> None:
     write(tmp_path, PAYLOADS[:5])
     write(tmp_path, PAYLOADS[5:], first_key=50)
@@ -65,7 +72,7 @@ def test_a_reopened_log_goes_on(tmp_path: Path) -> None:
 def test_an_unclosed_log_keeps_every_appended_record(tmp_path: Path) -> None:
     log = open_log(tmp_path)
     for number, payload in enumerate(PAYLOADS):
-        log.append(payload, 10 * number, 10)
+        log.append([payload], 10 * number, 10)
     assert recover(open_log(tmp_path)) == PAYLOADS
     log.close()
 
@@ -110,7 +117,7 @@ def test_a_corrupt_record_is_skipped_counted_and_named(
 def test_segments_go_when_all_of_them_is_evicted(tmp_path: Path) -> None:
     log = open_log(tmp_path)
     for number, payload in enumerate(PAYLOADS):
-        log.append(payload, 10 * number, 10)
+        log.append([payload], 10 * number, 10)
     before = len(segments(tmp_path))
     log.forget(60)
     assert len(segments(tmp_path)) < before
@@ -124,7 +131,7 @@ def test_a_failed_append_leaves_the_log_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = open_log(tmp_path, segment_bytes=10_000)
-    log.append(PAYLOADS[0], 0, 10)
+    log.append([PAYLOADS[0]], 0, 10)
     real = os.write
 
     def short(descriptor: int, parts: Sequence[bytes]) -> int:
@@ -136,9 +143,9 @@ def test_a_failed_append_leaves_the_log_as_it_was(
     monkeypatch.setattr(os, "writev", short)
     monkeypatch.setattr(os, "write", full)
     with pytest.raises(OSError, match="No space left"):
-        log.append(PAYLOADS[1], 10, 10)
+        log.append([PAYLOADS[1]], 10, 10)
     monkeypatch.undo()
-    log.append(PAYLOADS[2], 10, 10)
+    log.append([PAYLOADS[2]], 10, 10)
     log.close()
     assert recover(open_log(tmp_path)) == [PAYLOADS[0], PAYLOADS[2]]
 

@@ -47,13 +47,12 @@ class LogAgainstList(RuleBasedStateMachine):
 
     @rule(sizes=st.lists(st.integers(1, 150), min_size=1, max_size=6))
     def append(self, sizes: list[int]) -> None:
-        for size in sizes:
-            payload = self.payload(size)
-            self.log.append(payload, self.key(len(self.model)), PER_PAYLOAD)
-            self.model.append(payload)
+        payloads = [self.payload(size) for size in sizes]
+        self.log.append(payloads, self.key(len(self.model)), PER_PAYLOAD * len(payloads))
+        self.model += payloads
 
-    @rule(size=st.integers(1, 150), written=st.integers(0, 20))
-    def append_to_a_full_disk(self, size: int, written: int) -> None:
+    @rule(sizes=st.lists(st.integers(1, 150), min_size=1, max_size=3), written=st.integers(0, 200))
+    def append_to_a_full_disk(self, sizes: list[int], written: int) -> None:
         real = os.write
 
         def short(descriptor: int, parts: Sequence[bytes]) -> int:
@@ -65,7 +64,8 @@ class LogAgainstList(RuleBasedStateMachine):
 
         with mock.patch("os.writev", short), mock.patch("os.write", full):
             try:
-                self.log.append(self.payload(size), self.key(len(self.model)), PER_PAYLOAD)
+                payloads = [self.payload(size) for size in sizes]
+                self.log.append(payloads, self.key(len(self.model)), PER_PAYLOAD * len(payloads))
             except OSError:
                 return
         raise AssertionError("a failed write was taken for a whole one")

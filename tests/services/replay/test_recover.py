@@ -83,7 +83,7 @@ def insert(service: ReplayService, *chunks: Chunk) -> list[str]:
     requests = [Answered(encode(c)) for c in chunks]
     for request in requests:
         service._insert(request)
-        service._store_logged()
+        service._commit()
     return [answer for request in requests for answer in request.answers]
 
 
@@ -160,18 +160,31 @@ def test_a_full_disk_holds_inserts_and_loses_nothing(
     assert start(tmp_path).metrics()["size"] == 32
 
 
-def test_what_was_logged_before_the_disk_was_full_is_acknowledged(
+def test_what_is_held_together_is_taken_when_it_comes_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service = start(tmp_path)
-    logged, held = (Answered(encode(chunk(n))) for n in range(2))
-    service._insert(logged)
+    insert(service, chunk(0))
+    requests = [Answered(encode(chunk(n))) for n in (1, 2, 1)]  # the last by an impatient actor
     monkeypatch.setattr(service._log, "append", full)
-    service._insert(held)
-    service._store_logged()
-    assert logged.answers == ["reply"]
-    assert held.answers == [FULL]
+    for request in requests:
+        service._insert(request)
+    service._commit()
+    assert [request.answers for request in requests] == [[FULL]] * 3
+    assert service.metrics()["size"] == 16
     monkeypatch.undo()
-    assert insert(service, chunk(1)) == ["reply"]
+    assert insert(service, chunk(1), chunk(2)) == ["reply"] * 2
+    assert service.metrics()["gaps"] == 0
+    assert rewards(service) == rewards(start(tmp_path)) == {0, 1, 2}
+
+
+def test_a_stream_that_was_held_from_its_first_chunk_on_is_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = start(tmp_path)
+    monkeypatch.setattr(service._log, "append", full)
+    assert insert(service, chunk(0)) == [FULL]
+    monkeypatch.undo()
+    assert insert(service, chunk(0)) == ["reply"]
     assert service.metrics()["duplicates"] == 0
-    assert start(tmp_path).metrics()["size"] == 32
+    assert service.metrics()["size"] == 16

@@ -65,7 +65,7 @@ def insert(service: ReplayService, *chunks: Chunk) -> None:
     for each in chunks:
         request = Answered(encode(each))
         service._insert(request)
-        service._store_logged()
+        service._commit()
         assert request.answers == ["reply"]
 
 
