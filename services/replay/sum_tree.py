@@ -1,5 +1,8 @@
 """Non-negative numbers with their sum, drawn in proportion to what they are (Schaul et al. 2016).
 
+Binary trees side by side: to add up and search a few thousand numbers that lie next to each other
+takes numpy less time than the levels it spares.
+
 Invariants (`check_invariants`): a node is the sum of its two children as computed last, never
 changed by a difference, so errors of rounding do not add up; an index whose value is 0 is never
 drawn. Pure numpy: each call works on all its indices at once, level by level.
@@ -14,16 +17,22 @@ MAX_NODES = 4  # for each value
 
 
 class SumTree:
-    """`size` values, 0 at first, as the leaves of a binary tree of float64 sums."""
+    """`size` values, 0 at first, as the leaves of binary trees of float64 sums.
 
-    def __init__(self, size: int) -> None:
+    num_roots: how many trees at most, a power of two.
+    """
+
+    def __init__(self, size: int, num_roots: int = 4096) -> None:
         if size < 1:
             raise ValueError("a sum tree needs at least one leaf")
         self._size = size
-        self._depth = (size - 1).bit_length()
-        self._first_leaf = 1 << self._depth
-        # Node i has the children 2i and 2i + 1; 1 is the root, 0 is unused.
+        levels = (size - 1).bit_length()
+        self._first_leaf = 1 << levels
+        self._first_root = min(num_roots, self._first_leaf)  # as many as come before it
+        self._depth = levels - (self._first_root.bit_length() - 1)
+        # Node i has the children 2i and 2i + 1; those before the first root are unused.
         self._nodes: Float64Array = np.zeros(2 * self._first_leaf, np.float64)
+        self._roots = self._nodes[self._first_root : 2 * self._first_root]
 
     def __len__(self) -> int:
         return self._size
@@ -31,7 +40,7 @@ class SumTree:
     @property
     def total(self) -> float:
         """Sum of all values."""
-        return float(self._nodes[1])
+        return float(self._roots.sum())
 
     @property
     def nbytes(self) -> int:
@@ -85,13 +94,16 @@ class SumTree:
         The total is cut into as many equal parts, and one index drawn of each, so that index i is
         expected len(uniforms) x value / total times. Raises ValueError when all values are 0.
         """
-        if self._nodes[1] == 0:
+        ends = self._roots.cumsum()
+        total = ends[-1]
+        if total == 0:
             raise ValueError("nothing to draw: all values are 0")
         count = len(uniforms)
-        nodes = np.ones(count, np.int64)
-        left_over = _below(
-            (np.arange(count) + uniforms) / count * self._nodes[1], self._nodes[nodes]
-        )
+        targets = _below((np.arange(count) + uniforms) / count * total, total)
+        trees = ends.searchsorted(targets, side="right")
+        nodes = trees + self._first_root
+        starts = np.where(trees > 0, ends[trees - 1], 0.0)
+        left_over = _below(targets - starts, self._nodes[nodes])
         for _ in range(self._depth):
             nodes *= 2
             lefts = self._nodes[nodes]
@@ -106,7 +118,7 @@ class SumTree:
 
     def check_invariants(self) -> None:
         """Raise AssertionError where a node is not the sum of its children, or negative."""
-        inner = np.arange(1, self._first_leaf)
+        inner = np.arange(self._first_root, self._first_leaf)
         sums = self._nodes[2 * inner] + self._nodes[2 * inner + 1]
         if not np.array_equal(self._nodes[inner], sums):
             raise AssertionError("a node is not the sum of its children")
@@ -115,11 +127,11 @@ class SumTree:
 
 
 def _check_values(values: Float64Array) -> None:
-    if not (np.isfinite(values).all() and (values >= 0).all()):
+    if len(values) and not (values.min() >= 0 and values.max() < np.inf):
         raise ValueError("a value is negative or not finite")
 
 
-def _below(targets: Float64Array, sums: Float64Array) -> Float64Array:
+def _below(targets: Float64Array, sums: Float64Array | np.float64) -> Float64Array:
     """Targets held below the sums they fall into; rounding may have put them on the edge.
 
     A target below a sum leads to a child with a sum above 0, and so on down to a leaf above 0.

@@ -15,8 +15,11 @@ VALUES = st.one_of(st.just(0.0), st.floats(1e-12, 1e12), st.floats(0.0, 1.0, wid
 BELOW_ONE = st.floats(0.0, 1.0, exclude_max=True)
 
 
-def tree_of(values: list[float]) -> SumTree:
-    tree = SumTree(len(values))
+ROOTS = st.sampled_from([1, 2, 8, 4096])
+
+
+def tree_of(values: list[float], num_roots: int = 2) -> SumTree:
+    tree = SumTree(len(values), num_roots)
     tree.set(np.arange(len(values)), np.array(values))
     return tree
 
@@ -24,9 +27,9 @@ def tree_of(values: list[float]) -> SumTree:
 class TreeAgainstList(RuleBasedStateMachine):
     """Values by index; sums and draws follow from them."""
 
-    @initialize(size=st.integers(1, 70))
-    def make(self, size: int) -> None:
-        self.tree = SumTree(size)
+    @initialize(size=st.integers(1, 70), num_roots=ROOTS)
+    def make(self, size: int, num_roots: int) -> None:
+        self.tree = SumTree(size, num_roots)
         self.model = [0.0] * size
 
     @rule(data=st.data())
@@ -79,12 +82,17 @@ def test_draws_by_hand() -> None:
     assert tree.sample(np.array([0.26, 0.99])).tolist() == [2, 3]
 
 
-@given(st.lists(VALUES, min_size=1, max_size=70).filter(any), st.integers(1, 9))
-@example([1.0, 2.0**-53, 2.0**-53], 1)
-@example([3.0, 0.0, 0.1, 0.0], 3)
-@example([5e-324], 2)
-def test_the_greatest_uniform_draws_no_zero(values: list[float], count: int) -> None:
-    tree = tree_of(values)
+@given(st.lists(VALUES, min_size=1, max_size=70).filter(any), st.integers(1, 9), ROOTS)
+@example([1.0, 2.0**-53, 2.0**-53], 1, 1)
+@example([1.0, 2.0**-53, 2.0**-53], 1, 4096)
+@example([3.0, 0.0, 0.1, 0.0], 3, 1)
+@example([1e12, 0.0, 1e-12, 0.0], 3, 2)
+@example([1e12, 0.0, 1e-12, 0.0], 3, 4096)
+@example([5e-324], 2, 1)
+def test_the_greatest_uniform_draws_no_zero(
+    values: list[float], count: int, num_roots: int
+) -> None:
+    tree = tree_of(values, num_roots)
     drawn = tree.sample(np.full(count, np.nextafter(1.0, 0.0)))
     assert (tree.get(drawn) > 0).all()
 
