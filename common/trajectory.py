@@ -12,16 +12,16 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-UInt8Array = NDArray[np.uint8]
-Float32Array = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
-Int64Array = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+# in full, since numpy.typing.NDArray hides its dtype from version 2.5 on, where it is an alias
+UInt8Array = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
+Float32Array = np.ndarray[tuple[Any, ...], np.dtype[np.float32]]
+Float64Array = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+Int64Array = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
 NUM_ACTIONS = 3  # left, straight, right (paper section 3)
 NO_SLOT = -1  # of an actor to which no slot of exploration is leased
