@@ -22,7 +22,7 @@ from common.arena.rendering import draw_arena, literal_views
 from common.arena.rewards import frame_rewards, target_distances_px
 from common.arena.scene import LEFT, RIGHT, STRAIGHT, Layout, Scene, Start
 from common.arena.starts import test_starts, training_start
-from common.arena.symmetry import IDENTITY, Symmetry
+from common.arena.symmetry import IDENTITY, SYMMETRIES, Symmetry
 from common.arena.views import AnalyticViews
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "LEFT",
     "RIGHT",
     "STRAIGHT",
+    "SYMMETRIES",
     "AnalyticViews",
     "Arena",
     "ArenaBatch",

@@ -19,7 +19,7 @@ from common.arena.obstacles import (
     scattered,
 )
 from common.arena.scene import Layout
-from common.arena.symmetry import IDENTITY, Symmetry
+from common.arena.symmetry import IDENTITY, SYMMETRIES, Symmetry
 from common.config import ArenaConfig
 from common.errors import ConfigError
 from common.trajectory import Float64Array
@@ -88,8 +88,7 @@ def layout_symmetries(config: ArenaConfig) -> tuple[Symmetry, ...]:
     nothing in them, a reflection mirrors them left to right; so the identity, and the mirror if a
     reflection maps the layout onto itself.
     """
-    every = (Symmetry(*flags) for flags in product((False, True), repeat=3))
-    kept = tuple(symmetry for symmetry in every if _maps_onto_itself(symmetry, config))
+    kept = tuple(symmetry for symmetry in SYMMETRIES if _maps_onto_itself(symmetry, config))
     if config.orientation == "unrotated":
         return kept
     mirror = Symmetry(transpose=False, flip_x=True, flip_y=False)

@@ -5,6 +5,7 @@ the picture of the mapped scene is the mapped picture of the scene.
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -64,4 +65,5 @@ class Symmetry:
         return Scene(robots, self.apply_to_points(scene.targets, size_px), obstacles)
 
 
-IDENTITY = Symmetry(transpose=False, flip_x=False, flip_y=False)
+SYMMETRIES = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3))
+IDENTITY = SYMMETRIES[0]

@@ -1,6 +1,5 @@
 """Pictures: the analytic renderer against OpenCV, symmetries, and what any bytes give."""
 
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.arena import Scene, Symmetry, draw_arena, literal_views, make_codec, starts
+from common.arena import SYMMETRIES, Scene, Symmetry, draw_arena, literal_views, make_codec, starts
 from common.config import ArenaConfig
 from common.trajectory import UInt8Array
 
@@ -19,7 +18,6 @@ OBSTRUCTED = {
     "obstacles_px": ((300, 120, 35),),
     "inner_walls_px": ((250, 300, 350, 300), (420, 330, 500, 460)),
 }
-EVERY = [Symmetry(*flags) for flags in product((False, True), repeat=3)]
 
 
 def scenes(config: ArenaConfig, num: int, seed: int = 0) -> list[Scene]:
@@ -120,7 +118,7 @@ def test_heading_up_puts_ahead_at_the_top() -> None:
 
 
 @pytest.mark.parametrize("num_obstacles", [0, 3])
-@pytest.mark.parametrize("symmetry", EVERY)
+@pytest.mark.parametrize("symmetry", SYMMETRIES)
 def test_the_mapped_scene_gives_the_mapped_picture(symmetry: Symmetry, num_obstacles: int) -> None:
     config = ArenaConfig(num_robots=4, target_layout="random", num_obstacles=num_obstacles)
     for scene in scenes(config, 40):
@@ -134,7 +132,7 @@ def test_the_mapped_scene_gives_the_mapped_picture(symmetry: Symmetry, num_obsta
             assert gaps.max() <= 7
 
 
-@pytest.mark.parametrize("symmetry", EVERY)
+@pytest.mark.parametrize("symmetry", SYMMETRIES)
 def test_heading_up_knows_mirrors_only(symmetry: Symmetry) -> None:
     config = ArenaConfig(num_robots=4, target_layout="random", orientation="heading_up")
     mirror = Symmetry(transpose=False, flip_x=symmetry.mirrors, flip_y=False)
@@ -146,10 +144,10 @@ def test_heading_up_knows_mirrors_only(symmetry: Symmetry) -> None:
 
 def test_actions_are_swapped_by_mirrors_only() -> None:
     actions = np.array([[0, 1, 2]], np.uint8)
-    for symmetry in EVERY:
+    for symmetry in SYMMETRIES:
         expected = [[2, 1, 0]] if symmetry.mirrors else [[0, 1, 2]]
         assert symmetry.apply_to_actions(actions).tolist() == expected
-    assert sum(s.mirrors for s in EVERY) == 4
+    assert sum(s.mirrors for s in SYMMETRIES) == 4
 
 
 @pytest.mark.parametrize("renderer", ["analytic", "literal"])
