@@ -40,6 +40,7 @@ PLACES = {
         "services/actor",
         "services/evaluator",
     ),
+    "cuda": ("services/learner/kernels.py",),
     "safetensors": ("common/network.py", "services/learner"),
     "matplotlib": ("services/dashboard",),
     "av": ("services/dashboard",),

@@ -29,7 +29,7 @@ HEADING_CAP_PX = 1.0  # of the line, beyond the robot's centre and rim
 DISC_LOSS_PX = 0.04  # of a radius of 15 to 40 px
 _NUM_LINES = 4  # scan lines a row of pixels, at Gauss-Legendre nodes: 5 grey levels off at most
 _LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(_NUM_LINES)
-_NODES, _WEIGHTS = (_LEGENDRE_NODES + 1) / 2, _LEGENDRE_WEIGHTS / 2  # on [0, 1]
+NODES, WEIGHTS = (_LEGENDRE_NODES + 1) / 2, _LEGENDRE_WEIGHTS / 2  # on [0, 1]
 _BLOCK = 8  # pixels of a row that a disc paints at once, of the 31 and more there are
 
 
@@ -226,7 +226,7 @@ def _place_lines(lines, first, last, low, high, y):  # type: ignore[no-untyped-d
     for i in range(first, last):
         top, tall = _slice(i, low, high, y)
         for k in range(_NUM_LINES):
-            lines[0, num] = top + _NODES[k] * tall
+            lines[0, num] = top + NODES[k] * tall
             num += np.uintp(1)
     return num
 
@@ -245,10 +245,10 @@ def _share(left, tall, lows, highs):  # type: ignore[no-untyped-def]
 
     Inlined by numba: LLVM would first unroll the loops around a mere call, and so make no vectors.
     """
-    share = _WEIGHTS[0] * tall * _part(left, lows[0], highs[0])
-    share += _WEIGHTS[1] * tall * _part(left, lows[1], highs[1])
-    share += _WEIGHTS[2] * tall * _part(left, lows[2], highs[2])
-    share += _WEIGHTS[3] * tall * _part(left, lows[3], highs[3])
+    share = WEIGHTS[0] * tall * _part(left, lows[0], highs[0])
+    share += WEIGHTS[1] * tall * _part(left, lows[1], highs[1])
+    share += WEIGHTS[2] * tall * _part(left, lows[2], highs[2])
+    share += WEIGHTS[3] * tall * _part(left, lows[3], highs[3])
     return min(share, 1.0)
 
 

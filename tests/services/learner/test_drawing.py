@@ -1,126 +1,175 @@
-"""Pictures drawn by torch are those of the host, symmetries included; here on the CPU's tensors."""
+"""Pictures that a GPU draws are those of the host, symmetries included.
 
+No GPU needs to be here: its kernel's source is C++ as well, which the machine's compiler takes.
+"""
+
+import ctypes
+import logging
+import shutil
+import subprocess
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from common.arena import Scene, Symmetry, make_codec
+from common.arena import SYMMETRIES, Scene, make_codec
 from common.config import ArenaConfig, load_config
 from common.trajectory import UInt8Array
-from services.learner.drawing import DeviceDrawing, HostDrawing, ThreadedDecode, make_drawing
+from services.learner import drawing
+from services.learner.drawing import (
+    DeviceDrawing,
+    HostDrawing,
+    Paint,
+    ThreadedDecode,
+    definitions,
+    drawing_source,
+    make_drawing,
+)
+from services.learner.kernels import KernelError, compile_kernel, machine_code
 
-EVERY = [Symmetry(*flags) for flags in product((False, True), repeat=3)]
+CROWDED = {
+    "num_targets": 5,
+    "num_obstacles": 2,
+    "obstacles_px": [[120, 130, 25]],
+    "inner_walls_px": [[200, 0, 200, 250], [350.5, 400, 520, 310]],
+}
+CONFIGS = [
+    {"num_robots": num_robots, "orientation": orientation, **more}
+    for orientation in ("unrotated", "heading_up")
+    for num_robots, more in [
+        (2, {}),
+        (1, {"crop_px": 150.5}),
+        (10, {"crop_px": 1500, "view_px": 31}),
+        (3, {"robot_radius_px": 5, "target_size_px": 3}),
+        (4, CROWDED),
+    ]
+]
+
+
+@pytest.fixture(scope="module")
+def compiler() -> str:
+    found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if found is None:
+        pytest.skip("NO C++ COMPILER HERE: the GPU's drawing is not tested")
+    return found
+
+
+@pytest.fixture
+def compiled(compiler: str, tmp_path: Path) -> Any:
+    """A configuration's kernel for the CPU."""
+
+    def compile_for(config: ArenaConfig) -> Paint:
+        source, library = tmp_path / "drawing.cpp", tmp_path / "drawing.so"
+        source.write_text(drawing_source(), "utf-8")
+        macros = [f"-D{name}={value}" for name, value in definitions(config).items()]
+        options = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+        command = [compiler, *options, *macros, str(source), "-o", str(library)]
+        built = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert built.returncode == 0, built.stderr
+        draw = ctypes.CDLL(str(library)).draw
+
+        def paint(scenes: torch.Tensor, symmetries: torch.Tensor, pictures: torch.Tensor) -> None:
+            rows, width = scenes.shape[:2]
+            pointers = [ctypes.c_void_p(x.data_ptr()) for x in (scenes, symmetries, pictures)]
+            draw(*pointers, width, rows * width)
+
+        return paint
+
+    return compile_for
+
+
+def arena(**settings: Any) -> ArenaConfig:
+    return ArenaConfig.model_validate(settings)
+
+
+def scenes(config: ArenaConfig, num: int, seed: int = 0) -> list[Scene]:
+    """By chance; shapes overlap and reach outside."""
+    rng = np.random.default_rng(seed)
+    radii = rng.uniform(3, 40, (num, config.obstacle_count, 1))
+    return [
+        Scene(
+            rng.uniform((-50, -50, -np.pi), (650, 650, np.pi), (config.num_robots, 3)),
+            rng.uniform(-50, 650, (config.target_count, 2)),
+            np.hstack([rng.uniform(-50, 650, (config.obstacle_count, 2)), radius]),
+        )
+        for radius in radii
+    ]
 
 
 def records(config: ArenaConfig, num_scenes: int, seed: int = 0) -> UInt8Array:
-    """Of all robots of scenes by chance, [num_scenes, K, R]; shapes overlap and reach outside."""
-    rng, codec, num = np.random.default_rng(seed), make_codec(config), config.num_robots
-    scenes = [
-        Scene(
-            rng.uniform((-50, -50, -np.pi), (650, 650, np.pi), (num, 3)),
-            rng.uniform(-50, 650, (num, 2)),
-        )
-        for _ in range(num_scenes)
-    ]
-    return np.stack([codec.encode(scene) for scene in scenes])
+    """Of all robots of scenes by chance, [num_scenes, K, R]."""
+    codec = make_codec(config)
+    return np.stack([codec.encode(scene) for scene in scenes(config, num_scenes, seed)])
 
 
-def both(config: ArenaConfig, given: UInt8Array, turns: Any = ()) -> tuple[UInt8Array, UInt8Array]:
-    """Pictures by the host and by the device."""
+def largest_gap(one: torch.Tensor, other: torch.Tensor) -> int:
+    assert one.dtype == other.dtype == torch.uint8
+    assert one.shape == other.shape
+    return int((one.int() - other.int()).abs().max())
+
+
+@pytest.mark.parametrize("settings", CONFIGS)
+def test_the_device_draws_what_the_host_draws(compiled: Any, settings: dict[str, Any]) -> None:
+    config = arena(**settings)
+    given = records(config, 200)
+    turns = [(symmetry, np.arange(i, 200, 9)) for i, symmetry in enumerate(SYMMETRIES)]
     host = HostDrawing(make_codec(config).decode)(given, turns)
-    device = DeviceDrawing(config, "cpu")(given, turns)
-    assert host.dtype == device.dtype == torch.uint8
-    assert host.shape == device.shape
-    return host.numpy(), device.numpy()
-
-
-def largest_gap(one: UInt8Array, other: UInt8Array) -> int:
-    return int(np.abs(one.astype(int) - other).max())
-
-
-@settings(max_examples=60)
-@given(
-    num_robots=st.integers(1, 10),
-    orientation=st.sampled_from(["unrotated", "heading_up"]),
-    crop_px=st.floats(150, 1500),
-    view_px=st.sampled_from([31, 60]),
-    seed=st.integers(0, 2**32),
-)
-def test_the_device_draws_what_the_host_draws(
-    num_robots: int, orientation: str, crop_px: float, view_px: int, seed: int
-) -> None:
-    config = ArenaConfig.model_validate(
-        {
-            "num_robots": num_robots,
-            "orientation": orientation,
-            "crop_px": crop_px,
-            "view_px": view_px,
-        }
-    )
-    host, device = both(config, records(config, 3, seed))
+    device = DeviceDrawing(config, "cpu", compiled(config))(given, turns)
     assert host.any()
     assert largest_gap(host, device) <= 1
 
 
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
-def test_headings_along_the_axes(orientation: str) -> None:
+def test_headings_along_the_axes(compiled: Any, orientation: str) -> None:
     """Where cosines are 0 or nearly so; with walls, targets and robots on whole pixels."""
-    config = ArenaConfig.model_validate({"num_robots": 4, "orientation": orientation})
+    config = arena(num_robots=4, orientation=orientation)
     headings = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2])
     places = [(300, 300), (100, 200), (37, 563), (450, 150)]
     targets = np.array([[300.0, 300.0], [175, 175], [425, 425], [100, 200]])
-    robots = np.column_stack([places, headings])
-    given = make_codec(config).encode(Scene(robots, targets))
-    assert largest_gap(*both(config, given)) <= 1
+    given = make_codec(config).encode(Scene(np.column_stack([places, headings]), targets))[None]
+    host = HostDrawing(make_codec(config).decode)(given, ())
+    assert largest_gap(host, DeviceDrawing(config, "cpu", compiled(config))(given, ())) <= 1
 
 
-@given(
-    numbers=st.lists(st.floats(width=32), min_size=10, max_size=10),
-    orientation=st.sampled_from(["unrotated", "heading_up"]),
-)
-def test_any_record_gives_some_picture(numbers: list[float], orientation: str) -> None:
-    config = ArenaConfig.model_validate({"orientation": orientation})
-    given = np.array(numbers, "<f4").view(np.uint8)
-    assert DeviceDrawing(config, "cpu")(given[None], ()).shape == (1, 60, 60)
+@pytest.mark.parametrize("settings", [{}, {"orientation": "heading_up"}, CROWDED])
+def test_any_record_gives_some_picture(compiled: Any, settings: dict[str, Any]) -> None:
+    config = arena(**settings)
+    rng = np.random.default_rng(0)
+    given = rng.integers(0, 256, (300, 2, config.record_bytes), dtype=np.uint8)
+    numbers = given.view("<f4")
+    odd = np.array([0, np.nan, np.inf, -np.inf, 1e38, -1e38, 300], "<f4")
+    replaced = rng.random(numbers.shape) < 0.5
+    numbers[replaced] = rng.choice(odd, int(replaced.sum()))
+    assert DeviceDrawing(config, "cpu", compiled(config))(given, ()).shape == (300, 2, 60, 60)
 
 
-def test_records_that_are_packed_read_only_bytes_are_drawn() -> None:
+def test_records_that_are_packed_read_only_bytes_are_drawn(compiled: Any) -> None:
     config = ArenaConfig()
     aligned = records(config, 3)
     packed = np.frombuffer(b"x" + aligned.tobytes(), np.uint8)[1:].reshape(aligned.shape)
-    np.testing.assert_array_equal(
-        DeviceDrawing(config, "cpu")(packed, ()), DeviceDrawing(config, "cpu")(aligned, ())
-    )
+    draw = DeviceDrawing(config, "cpu", compiled(config))
+    assert torch.equal(draw(packed, ()), draw(aligned, ()))
 
 
-def test_records_of_another_arena_are_refused() -> None:
-    given = records(ArenaConfig(num_robots=3), 1)
-    with pytest.raises(ValueError, match=r"not uint8 \[..., 40\]"):
-        DeviceDrawing(ArenaConfig(num_robots=2), "cpu")(given, ())
+def never(*_: torch.Tensor) -> None:
+    raise AssertionError("nothing is to be painted")
+
+
+@pytest.mark.parametrize("shape", [(1, 2, 52), (1, 40), (1, 1, 2, 40)])
+def test_records_of_another_arena_are_refused(shape: tuple[int, ...]) -> None:
+    draw = DeviceDrawing(arena(num_robots=2), "cpu", never)
+    with pytest.raises(ValueError, match=r"not uint8 \[B, W, 40\]"):
+        draw(np.zeros(shape, np.uint8), ())
 
 
 def test_no_records_give_no_pictures() -> None:
     config = ArenaConfig()
-    assert DeviceDrawing(config, "cpu")(records(config, 3)[:0], ()).shape == (0, 2, 60, 60)
-
-
-@pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
-def test_symmetries_act_on_both_alike(orientation: str) -> None:
-    config = ArenaConfig.model_validate({"num_robots": 3, "orientation": orientation})
-    given = records(config, 16)
-    turns = [(symmetry, np.array([i, 15 - i])) for i, symmetry in enumerate(EVERY)]
-    host, device = both(config, given, turns)
-    assert largest_gap(host, device) <= 1
-    plain = DeviceDrawing(config, "cpu")(given, ()).numpy()
-    for symmetry, rows in turns:
-        np.testing.assert_array_equal(device[rows], symmetry.apply_to_pictures(plain[rows]))
+    draw = DeviceDrawing(config, "cpu", never)
+    assert draw(np.zeros((0, 2, config.record_bytes), np.uint8), ()).shape == (0, 2, 60, 60)
 
 
 @pytest.mark.parametrize(
@@ -132,17 +181,43 @@ def test_symmetries_act_on_both_alike(orientation: str) -> None:
         ("cuda", {"arena.renderer": "literal"}, HostDrawing),
         ("cuda", {"arena.codec": "frames"}, HostDrawing),
         ("cuda", {"arena.num_targets": "3"}, DeviceDrawing),
-        ("cuda", {"arena.num_obstacles": "1"}, HostDrawing),
-        ("cuda", {"arena.inner_walls_px": "[[100, 100, 200, 100]]"}, HostDrawing),
+        ("cuda", {"arena.num_obstacles": "1"}, DeviceDrawing),
+        ("cuda", {"arena.inner_walls_px": "[[100, 100, 200, 100]]"}, DeviceDrawing),
         ("cuda", {"arena.pixel_noise": "2.0"}, HostDrawing),
     ],
 )
 def test_a_gpu_draws_scenes_itself(
     monkeypatch: pytest.MonkeyPatch, device: str, overrides: dict[str, str], expected: type
 ) -> None:
-    monkeypatch.setattr("services.learner.drawing.DeviceViews", lambda *_: None)
-    arena = load_config("quick", overrides, {}).arena
-    assert type(make_drawing(arena, torch.device(device))) is expected
+    monkeypatch.setattr(drawing, "_device_paint", lambda *_: never)  # no GPU needs to be here
+    config = load_config("quick", overrides, {}).arena
+    assert type(make_drawing(config, torch.device(device))) is expected
+
+
+def test_where_the_kernel_cannot_be_had_the_host_draws_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object) -> Paint:
+        raise KernelError("cuda-bindings is missing")
+
+    monkeypatch.setattr(drawing, "_device_paint", refuse)
+    with caplog.at_level(logging.WARNING, "learner"):
+        assert type(make_drawing(ArenaConfig(), torch.device("cuda"))) is HostDrawing
+    assert "pictures are drawn on the CPU: cuda-bindings is missing" in caplog.text
+
+
+def test_a_kernel_of_a_device_that_is_no_gpu_is_refused() -> None:
+    with pytest.raises(KernelError, match="cpu is no CUDA device"):
+        compile_kernel("", "draw", torch.device("cpu"), {})
+
+
+@pytest.mark.parametrize("settings", CONFIGS)
+def test_the_kernel_compiles_for_gpus(settings: dict[str, Any]) -> None:
+    """Where PyTorch's build for CUDA is, the compiler is as well, GPU or not."""
+    pytest.importorskip("cuda.bindings.nvrtc", reason="only with PyTorch's builds for CUDA")
+    assert machine_code(drawing_source(), "draw", (9, 0), definitions(arena(**settings)))
+    with pytest.raises(KernelError, match=r"draw does not compile: .*expected"):
+        machine_code("extern !", "draw", (9, 0), {})
 
 
 @pytest.fixture
@@ -154,7 +229,7 @@ def threads() -> Iterator[Executor]:
 @pytest.mark.parametrize("codec", ["scene", "frames"])
 @pytest.mark.parametrize("num_scenes", [0, 1, 128, 129, 400])
 def test_threads_draw_the_same_pictures(threads: Executor, codec: str, num_scenes: int) -> None:
-    config = ArenaConfig.model_validate({"num_robots": 2, "codec": codec})
+    config = arena(num_robots=2, codec=codec)
     given = records(config, max(num_scenes, 1))[:num_scenes]
     given.flags.writeable = False  # as they come off the wire
     alone = make_drawing(config, torch.device("cpu"))(given, ())

@@ -1,0 +1,99 @@
+"""Kernels of our own, compiled for the GPU at hand by NVIDIA's run-time compiler.
+
+PyTorch's builds for CUDA bring that compiler and its binding (`cuda-bindings`) along; no toolkit
+and no C compiler need to be there. Where they are missing, KernelError says so.
+"""
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class KernelError(Exception):
+    """A kernel that cannot be had on this device; the text says why."""
+
+
+class Kernel:
+    """One function of a compiled source, on one device."""
+
+    def __init__(self, function: Any, module: Any, device: torch.device) -> None:
+        self._function = function
+        self._module = module  # lives as long as its function
+        self._device = device
+
+    def __call__(self, blocks: int, threads: int, arguments: Sequence[Tensor | int]) -> None:
+        """Launch it on the device's current stream; tensors go as pointers, numbers as int."""
+        from cuda.bindings import driver
+
+        values = tuple(x if isinstance(x, int) else x.data_ptr() for x in arguments)
+        kinds = tuple(ctypes.c_int if isinstance(x, int) else ctypes.c_void_p for x in arguments)
+        shape = blocks, 1, 1, threads, 1, 1
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.current_stream().cuda_stream
+            _check(driver.cuLaunchKernel(self._function, *shape, 0, stream, (values, kinds), 0))
+
+
+def compile_kernel(
+    source: str, name: str, device: torch.device, definitions: Mapping[str, object]
+) -> Kernel:
+    """The function `name` (extern "C") of a CUDA C++ source, for one device.
+
+    definitions: macros. Raises KernelError where the device is no CUDA device, the compiler is
+    missing, or it refuses.
+    """
+    if device.type != "cuda":
+        raise KernelError(f"{device} is no CUDA device")
+    try:
+        from cuda.bindings import driver
+    except ImportError as error:
+        raise KernelError(f"cuda-bindings is missing: {error}") from error
+    with torch.cuda.device(device):
+        torch.cuda.current_stream().synchronize()  # the context of the device exists from here on
+        binary = machine_code(source, name, torch.cuda.get_device_capability(), definitions)
+        (module,) = _check(driver.cuModuleLoadData(binary))
+        (function,) = _check(driver.cuModuleGetFunction(module, name.encode()))
+    return Kernel(function, module, device)
+
+
+def machine_code(
+    source: str, name: str, capability: tuple[int, int], definitions: Mapping[str, object]
+) -> bytes:
+    """Compiled for devices of this compute capability, of which none needs to be here.
+
+    Raises KernelError as `compile_kernel` does.
+    """
+    try:
+        from cuda.bindings import nvrtc
+    except ImportError as error:
+        raise KernelError(f"cuda-bindings is missing: {error}") from error
+    defined = [f"--define-macro={key}={value}" for key, value in definitions.items()]
+    options = ["--gpu-architecture=sm_{}{}".format(*capability), "--std=c++17", *defined]
+    try:
+        (program,) = _check(
+            nvrtc.nvrtcCreateProgram(source.encode(), f"{name}.cu".encode(), 0, [], [])
+        )
+    except RuntimeError as error:  # the library is not there
+        raise KernelError(f"the run-time compiler is missing: {error}") from error
+    (result,) = nvrtc.nvrtcCompileProgram(program, len(options), [o.encode() for o in options])
+    if result != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+        log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
+        raise KernelError(f"{name} does not compile: {log.decode(errors='replace').strip()}")
+    return _read(nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN, program)
+
+
+def _read(size_of: Any, fill: Any, program: Any) -> bytes:
+    (size,) = _check(size_of(program))
+    buffer = b" " * int(size)
+    _check(fill(program, buffer))  # writes into it
+    return buffer
+
+
+def _check(result: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What a call of the bindings gave besides its error."""
+    error, *values = result
+    if int(error) != 0:
+        raise KernelError(f"CUDA refused: {error.name}")
+    return tuple(values)
