@@ -32,6 +32,7 @@ FORMAT_VERSION: Final = 1
 SENT_AS: Final = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _METADATA_KEY: Final = "mrcdrl"  # one JSON text: safetensors does not keep an order of several
 _WHITE: Final = 255.0
+_CHANNELS: Final = 8  # that a GPU's tensor cores take at once, in half precision
 _FLOAT32 = ("conv1.", "value.", "advantage.", "action_value.")  # operands that are it always
 
 States = Tensor | LitPixels  # as the first layer takes them
@@ -150,7 +151,24 @@ class QNetwork(nn.Module):
 
         In two passes: converting and reordering at once is twice as slow on a CPU.
         """
+        if observation.device.type == "cuda" and self.compute_dtype == torch.bfloat16:
+            return self._with_black(observation)
         return observation.to(self.compute_dtype).contiguous(memory_format=torch.channels_last)
+
+    def _with_black(self, observation: Tensor) -> Tensor:
+        """With black pictures up to a multiple of 8: as tensor cores take them, four times as fast
+        as four.
+        """
+        num, stack, size, _ = observation.shape
+        padded = torch.empty(
+            (num, stack + -stack % _CHANNELS, size, size),
+            dtype=self.compute_dtype,
+            device=observation.device,
+            memory_format=torch.channels_last,
+        )
+        padded[:, stack:] = 0
+        padded[:, :stack] = observation
+        return padded
 
     def operands(self) -> Operands:
         """The parameters as `evaluate` takes them, with gradient; valid until they change.
@@ -181,6 +199,8 @@ class QNetwork(nn.Module):
             x = first_layer(states, weight, bias).to(self.compute_dtype)
         else:
             weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)
+            if black := states.shape[1] - self.stack:
+                weight = functional.pad(weight, (0, 0, 0, 0, 0, black))
             x = functional.max_pool2d(functional.conv2d(states, weight, bias, stride=2), 2)
             x = functional.relu_(x)
         trace.units.append(x)
