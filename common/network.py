@@ -22,6 +22,8 @@ from torch.nn import functional
 
 from common.errors import CheckpointError, ConfigError
 from common.first_layer import LitPixels, first_layer, lit_pixels
+from common.first_layer_cuda import Pictures, pictures_on_gpu
+from common.first_layer_cuda import first_layer as first_layer_on_gpu
 from common.trajectory import NUM_ACTIONS
 
 Kind = Literal["duel", "ddqn", "dqn"]
@@ -32,10 +34,9 @@ FORMAT_VERSION: Final = 1
 SENT_AS: Final = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 _METADATA_KEY: Final = "mrcdrl"  # one JSON text: safetensors does not keep an order of several
 _WHITE: Final = 255.0
-_CHANNELS: Final = 8  # that a GPU's tensor cores take at once, in half precision
 _FLOAT32 = ("conv1.", "value.", "advantage.", "action_value.")  # operands that are it always
 
-States = Tensor | LitPixels  # as the first layer takes them
+States = Tensor | LitPixels | Pictures  # as the first layer takes them
 Operands = dict[str, Tensor]  # by parameter name
 
 
@@ -138,37 +139,22 @@ class QNetwork(nn.Module):
     def prepare(self, observation: Tensor) -> States:
         """States uint8 [B, S, V, V] as the first layer is fastest on them.
 
-        On a CPU those that are mostly black are what is not black of them.
+        On a CPU those that are mostly black are what is not black of them; on a GPU that computes
+        in bfloat16 they are left as they are, where its kernels can be had.
         """
+        given: States | None = None
         if observation.device.type == "cpu":
-            lit = lit_pixels(observation)
-            if lit is not None:
-                return lit
-        return self._dense(observation)
+            given = lit_pixels(observation)
+        elif observation.device.type == "cuda" and self.compute_dtype == torch.bfloat16:
+            given = pictures_on_gpu(observation)
+        return self._dense(observation) if given is None else given
 
     def _dense(self, observation: Tensor) -> Tensor:
         """In the dtype and memory order of a convolution.
 
         In two passes: converting and reordering at once is twice as slow on a CPU.
         """
-        if observation.device.type == "cuda" and self.compute_dtype == torch.bfloat16:
-            return self._with_black(observation)
         return observation.to(self.compute_dtype).contiguous(memory_format=torch.channels_last)
-
-    def _with_black(self, observation: Tensor) -> Tensor:
-        """With black pictures up to a multiple of 8: as tensor cores take them, four times as fast
-        as four.
-        """
-        num, stack, size, _ = observation.shape
-        padded = torch.empty(
-            (num, stack + -stack % _CHANNELS, size, size),
-            dtype=self.compute_dtype,
-            device=observation.device,
-            memory_format=torch.channels_last,
-        )
-        padded[:, stack:] = 0
-        padded[:, :stack] = observation
-        return padded
 
     def operands(self) -> Operands:
         """The parameters as `evaluate` takes them, with gradient; valid until they change.
@@ -197,10 +183,10 @@ class QNetwork(nn.Module):
         weight, bias = operands["conv1.weight"], operands["conv1.bias"]
         if isinstance(states, LitPixels):
             x = first_layer(states, weight, bias).to(self.compute_dtype)
+        elif isinstance(states, Pictures):
+            x = first_layer_on_gpu(states, weight, bias)
         else:
             weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)
-            if black := states.shape[1] - self.stack:
-                weight = functional.pad(weight, (0, 0, 0, 0, 0, black))
             x = functional.max_pool2d(functional.conv2d(states, weight, bias, stride=2), 2)
             x = functional.relu_(x)
         trace.units.append(x)

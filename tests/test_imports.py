@@ -33,6 +33,8 @@ PLACES = {
     "pydantic": ("common/config.py",),
     "torch": (
         "common/first_layer.py",
+        "common/first_layer_cuda.py",
+        "common/kernels.py",
         "common/network.py",
         "common/policy.py",
         "common/precompile.py",
@@ -40,7 +42,7 @@ PLACES = {
         "services/actor",
         "services/evaluator",
     ),
-    "cuda": ("services/learner/kernels.py",),
+    "cuda": ("common/kernels.py",),
     "safetensors": ("common/network.py", "services/learner"),
     "matplotlib": ("services/dashboard",),
     "av": ("services/dashboard",),

@@ -10,7 +10,6 @@ Shapes: B = rows, W = records of a row, R = bytes of a record, V = width of a pi
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from importlib.resources import files
 from typing import Any, Protocol
 
 import numpy as np
@@ -33,8 +32,8 @@ from common.arena.views import (
     WEIGHTS,
 )
 from common.config import ArenaConfig
+from common.kernels import KernelError, compile_kernel, source_of
 from common.trajectory import Int64Array, UInt8Array
-from services.learner.kernels import KernelError, compile_kernel
 
 _LOG = logging.getLogger("learner")
 
@@ -130,18 +129,19 @@ class DeviceDrawing:
 
 def _device_paint(config: ArenaConfig, device: torch.device) -> Paint:
     """By the kernel of drawing.cu, compiled for this configuration."""
-    kernel = compile_kernel(drawing_source(), "draw", device, definitions(config))
+    macros = definitions(config)
+    kernel = compile_kernel(drawing_source(), "draw", device, macros, threads=_THREADS)
 
     def paint(scenes: Tensor, symmetries: Tensor, pictures: Tensor) -> None:
         rows, width = scenes.shape[:2]
-        kernel(rows * width, _THREADS, [scenes, symmetries, pictures, width])
+        kernel(rows * width, [scenes, symmetries, pictures, width])
 
     return paint
 
 
 def drawing_source() -> str:
     """CUDA C++ with the function `draw`; C++ as well."""
-    return files(__package__).joinpath("drawing.cu").read_text("utf-8")
+    return source_of("services.learner", "drawing.cu")
 
 
 def definitions(config: ArenaConfig) -> dict[str, object]:

@@ -23,15 +23,11 @@ KINDS: list[Kind] = ["duel", "ddqn", "dqn"]
 
 
 def make_network(
-    kind: Kind = "duel",
-    seed: int = 0,
-    view_px: int = 60,
-    dtype: torch.dtype = torch.float32,
-    stack: int = 4,
+    kind: Kind = "duel", seed: int = 0, view_px: int = 60, dtype: torch.dtype = torch.float32
 ) -> QNetwork:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return QNetwork(kind, stack=stack, view_px=view_px, compute_dtype=dtype)
+        return QNetwork(kind, view_px=view_px, compute_dtype=dtype)
 
 
 @pytest.mark.parametrize("name", ["bfloat16", "float16"])
@@ -57,9 +53,9 @@ def test_what_half_precision_cannot_hold_is_handed_to_nobody() -> None:
         weights_to_bytes(network, torch.float16)
 
 
-def random_states(count: int, view_px: int = 60, channels: int = 4) -> torch.Tensor:
+def random_states(count: int, view_px: int = 60) -> torch.Tensor:
     generator = torch.Generator().manual_seed(3)
-    shape = (count, channels, view_px, view_px)
+    shape = (count, 4, view_px, view_px)
     return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
 
 
@@ -94,24 +90,6 @@ def test_values_are_float32_for_every_batch_size(kind: Kind, dtype: torch.dtype)
         assert values.dtype == torch.float32
         assert values.shape == (count, 3)
         assert all(p.dtype == torch.float32 for p in network.parameters())
-
-
-@pytest.mark.parametrize("stack", [4, 8, 9])
-def test_black_pictures_that_fill_up_a_gpus_channels_change_no_value(stack: int) -> None:
-    network = make_network(stack=stack)
-    states = random_states(3, channels=stack)
-    padded = network._with_black(states)
-    assert padded.shape[1] == {4: 8, 8: 8, 9: 16}[stack]
-    operands = network.operands()
-    values = network.evaluate(padded, operands)
-    values.sum().backward()
-    gradient = network.conv1.weight.grad
-    assert gradient is not None
-    network.conv1.weight.grad = None
-    plain = network(states)
-    torch.testing.assert_close(values, plain)
-    plain.sum().backward()
-    torch.testing.assert_close(network.conv1.weight.grad, gradient)
 
 
 def test_parameters_are_the_papers() -> None:

@@ -18,6 +18,7 @@ import torch
 
 from common.arena import SYMMETRIES, Scene, make_codec
 from common.config import ArenaConfig, load_config
+from common.kernels import KernelError, compile_kernel, machine_code
 from common.trajectory import UInt8Array
 from services.learner import drawing
 from services.learner.drawing import (
@@ -29,7 +30,6 @@ from services.learner.drawing import (
     drawing_source,
     make_drawing,
 )
-from services.learner.kernels import KernelError, compile_kernel, machine_code
 
 CROWDED = {
     "num_targets": 5,
@@ -208,7 +208,7 @@ def test_where_the_kernel_cannot_be_had_the_host_draws_and_says_so(
 
 def test_a_kernel_of_a_device_that_is_no_gpu_is_refused() -> None:
     with pytest.raises(KernelError, match="cpu is no CUDA device"):
-        compile_kernel("", "draw", torch.device("cpu"), {})
+        compile_kernel("", "draw", torch.device("cpu"), {}, threads=1)
 
 
 @pytest.mark.parametrize("settings", CONFIGS)

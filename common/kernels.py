@@ -5,11 +5,15 @@ and no C compiler need to be there. Where they are missing, KernelError says so.
 """
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
 from typing import Any
 
 import torch
 from torch import Tensor
+
+Launch = Callable[[int, Sequence[Tensor | int]], None]
+"""Runs a kernel with so many blocks and these arguments: tensors as pointers, numbers as int."""
 
 
 class KernelError(Exception):
@@ -19,30 +23,52 @@ class KernelError(Exception):
 class Kernel:
     """One function of a compiled source, on one device."""
 
-    def __init__(self, function: Any, module: Any, device: torch.device) -> None:
+    def __init__(
+        self, function: Any, module: Any, device: torch.device, threads: int, shared_bytes: int
+    ) -> None:
         self._function = function
         self._module = module  # lives as long as its function
         self._device = device
+        self._threads = threads
+        self._shared_bytes = shared_bytes
 
-    def __call__(self, blocks: int, threads: int, arguments: Sequence[Tensor | int]) -> None:
-        """Launch it on the device's current stream; tensors go as pointers, numbers as int."""
+    def __call__(self, blocks: int, arguments: Sequence[Tensor | int]) -> None:
+        """Launch it on the device's current stream."""
         from cuda.bindings import driver
 
         values = tuple(x if isinstance(x, int) else x.data_ptr() for x in arguments)
         kinds = tuple(ctypes.c_int if isinstance(x, int) else ctypes.c_void_p for x in arguments)
-        shape = blocks, 1, 1, threads, 1, 1
+        shape = blocks, 1, 1, self._threads, 1, 1
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream().cuda_stream
-            _check(driver.cuLaunchKernel(self._function, *shape, 0, stream, (values, kinds), 0))
+            _check(
+                driver.cuLaunchKernel(
+                    self._function, *shape, self._shared_bytes, stream, (values, kinds), 0
+                )
+            )
+
+
+def source_of(package: str, name: str) -> str:
+    """The text of a source file that lies beside a package's modules."""
+    return files(package).joinpath(name).read_text("utf-8")
 
 
 def compile_kernel(
-    source: str, name: str, device: torch.device, definitions: Mapping[str, object]
+    source: str,
+    name: str,
+    device: torch.device,
+    definitions: Mapping[str, object],
+    *,
+    threads: int,
+    shared_bytes: int = 0,
 ) -> Kernel:
     """The function `name` (extern "C") of a CUDA C++ source, for one device.
 
-    definitions: macros. Raises KernelError where the device is no CUDA device, the compiler is
-    missing, or it refuses.
+    definitions: macros. threads: of a block. shared_bytes: of memory that it shares, besides what
+    the source declares with a size.
+
+    Raises KernelError where the device is no CUDA device or too small, the compiler is missing,
+    or it refuses.
     """
     if device.type != "cuda":
         raise KernelError(f"{device} is no CUDA device")
@@ -55,7 +81,9 @@ def compile_kernel(
         binary = machine_code(source, name, torch.cuda.get_device_capability(), definitions)
         (module,) = _check(driver.cuModuleLoadData(binary))
         (function,) = _check(driver.cuModuleGetFunction(module, name.encode()))
-    return Kernel(function, module, device)
+        most = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+        _check(driver.cuFuncSetAttribute(function, most, shared_bytes))
+    return Kernel(function, module, device, threads, shared_bytes)
 
 
 def machine_code(
