@@ -356,6 +356,9 @@ class LearnerConfig(Section):
     action with it. (ours)"""
     publish_period: Count = 100
     """Learner steps between publications of the weights. (ours)"""
+    publish_interval_s: Annotated[float, Field(ge=0)] = 0.2
+    """Seconds between publications at least: a learner that takes so many steps a second passes
+    over some, and leaves time to those who adopt them. Not with run.turn_size. (ours)"""
     publish_precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of published weights; half of it halves their bytes, and those who adopt them cast up. The
     best weights are kept as they were judged. (ours)"""

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
@@ -123,8 +124,10 @@ def run(
     meter = Meter(learner, prefetcher, priorities, keeper, Vitals(config, learner))
     limit, turns = config.run.learner_steps, Turns.of(config)
     publish_period = config.learner.publish_period if turns is None else turns.steps
+    interval_s = config.learner.publish_interval_s if turns is None else 0.0
     try:
         writer.publish(keeper.next_weights())
+        published_s = time.monotonic()
         while not stop.is_set() and (not limit or learner.learner_step < limit):
             most = min(learner.updates_per_launch, _steps_left(learner, publish_period, limit))
             batches = meter.timed("data_wait", partial(prefetcher.next, _POLL_S, most))
@@ -135,10 +138,12 @@ def run(
                 if priorities is not None:
                     for batch, update in zip(batches, updates, strict=True):
                         priorities.put(batch.keys, update.td_errors)
-                if learner.learner_step % publish_period == 0:
+                due = learner.learner_step % publish_period == 0
+                if due and time.monotonic() - published_s >= interval_s:
                     if turns is not None:  # on the disk before anyone acts by it
                         meter.timed("checkpoint", keeper.save)
                     meter.timed("publish", lambda: writer.publish(keeper.next_weights()))
+                    published_s = time.monotonic()
                 if turns is None:
                     meter.timed("checkpoint", keeper.maybe_save)
             reporter.maybe(meter.metrics)

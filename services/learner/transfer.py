@@ -15,10 +15,11 @@ def beside_the_step(
     """The same collate; on a GPU on a stream of its own, for use by one thread.
 
     It returns once the batch is there: the thread that prepares batches waits, the step does not.
+    Their few kernels therefore go before those of the step.
     """
     if device.type != "cuda":
         return collate
-    beside: Any = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    beside: Any = torch.cuda.Stream(device, priority=-1)  # type: ignore[no-untyped-call]
     usual = torch.cuda.default_stream(device)
 
     def collated(samples: Samples) -> Batch:

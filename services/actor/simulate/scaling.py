@@ -86,7 +86,10 @@ class Pace:
     def held(cls, config: Config, actors: int, rate: float, updates_per_s: float) -> "Pace":
         """The rate limiter lets in what the learner's updates draw."""
         drawn = updates_per_s * config.learner.batch_size / config.replay.samples_per_insert
-        publications_per_s = updates_per_s / config.learner.publish_period
+        learner = config.learner
+        publications_per_s = updates_per_s / learner.publish_period
+        if learner.publish_interval_s:
+            publications_per_s = min(publications_per_s, 1 / learner.publish_interval_s)
         return cls(actors, min(drawn, actors * rate), publications_per_s)
 
 

@@ -40,6 +40,8 @@ def test_who_waits_for_the_learner_gives_no_more_than_it_draws() -> None:
     one, many = (Pace.held(QUICK, actors, 4300.0, 100.0) for actors in (1, 1000))
     assert one.transitions_per_s == many.transitions_per_s == 100 * 32 / 4
     assert many.publications_per_s == 100 / QUICK.learner.publish_period
+    fast = Pace.held(QUICK, 1, 4300.0, 10_000.0)
+    assert fast.publications_per_s == 1 / QUICK.learner.publish_interval_s
     assert Pace.held(QUICK, 1, 10.0, 100.0).transitions_per_s == 10
 
 

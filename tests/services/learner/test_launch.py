@@ -156,13 +156,17 @@ class Ready:
         return batches(most)
 
 
-def test_no_launch_passes_over_a_publication_or_the_end(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("interval_s", "at"), [("0", [0, 4, 8, 9]), ("3600", [0, 9])])
+def test_no_launch_passes_over_a_publication_or_the_end(
+    tmp_path: Path, interval_s: str, at: list[int]
+) -> None:
     settings = {
         "arena.view_px": str(VIEW_PX),
         "learner.device": "cpu",
         "learner.precision": "float32",
         "learner.updates_per_launch": "3",
         "learner.publish_period": "4",
+        "learner.publish_interval_s": interval_s,
         "run.learner_steps": "9",
     }
     config = load_config(None, settings, environ={})
@@ -172,7 +176,7 @@ def test_no_launch_passes_over_a_publication_or_the_end(tmp_path: Path) -> None:
     writer.publish.side_effect = published.append
     keeper = Keeper(config, learner, tmp_path)
     run(config, learner, ready, priorities, writer, keeper, MagicMock(), StopSignal())  # type: ignore[arg-type]
-    assert [weights.learner_step for weights in published] == [0, 4, 8, 9]
+    assert [weights.learner_step for weights in published] == at
     assert ready.asked == [3, 1, 3, 1, 1]
     assert priorities.put.call_count == 9
 

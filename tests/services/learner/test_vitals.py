@@ -138,7 +138,11 @@ class Prefetched:
 
 
 def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_path: Path) -> None:
-    config = config_of(learner__publish_period="2", learner__checkpoint_period_s="1e-9")
+    config = config_of(
+        learner__publish_period="2",
+        learner__publish_interval_s="0",
+        learner__checkpoint_period_s="1e-9",
+    )
     learner = learner_of(config)
     keeper = Keeper(config, learner, tmp_path)
     published: list[Weights] = []
