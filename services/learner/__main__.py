@@ -37,6 +37,7 @@ from services.replay.client import PriorityWriter, ReplayReader
 
 _LOG = logging.getLogger("learner")
 _POLL_S = 0.2
+_WAITING_BATCHES = 64  # whose priorities are not sent yet: some 40 ms of the fastest learner
 
 
 def main(argv: Sequence[str]) -> int:
@@ -86,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
         if config.replay.prioritized:
             priorities = PrioritiesSender(
                 PriorityWriter(bulk, keys, stop, num_shards=config.replay.shards),
-                settings.prefetch_batches,
+                _WAITING_BATCHES,
             )
         writer = WeightsWriter(session, keys)
         reporter = StatsReporter(

@@ -6,6 +6,7 @@ are dropped and counted (harmless: the next draw of a transition brings a newer 
 """
 
 import threading
+import time
 from collections import deque
 
 import numpy as np
@@ -13,6 +14,8 @@ import torch
 
 from common.trajectory import Int64Array, Priorities
 from services.replay.client import PriorityWriter
+
+_GATHER_S = 0.01  # that a message waits for more batches: it costs more than what is in it
 
 
 class PrioritiesSender:
@@ -71,9 +74,11 @@ class PrioritiesSender:
                     self.dropped += len(batches)
 
     def _take(self) -> list[tuple[Int64Array, torch.Tensor]] | None:
-        """All that waits, once there is something; None when closing."""
+        """All that waits, a moment after there is something; None when closing."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing or self._waiting)
+        time.sleep(_GATHER_S)
+        with self._changed:
             if self._closing:
                 return None
             batches = list(self._waiting)

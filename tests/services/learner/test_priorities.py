@@ -12,6 +12,7 @@ import torch
 
 from common.errors import RefusedError
 from common.trajectory import Priorities, PrioritiesReply
+from services.learner import priorities
 from services.learner.priorities import PrioritiesSender
 
 _DEADLINE_S = 20.0
@@ -63,6 +64,14 @@ def test_absolute_errors_are_sent_by_key() -> None:
     assert message.priorities.tolist() == [3.0, 3.5]
     assert (message.keys.dtype, message.priorities.dtype) == (np.int64, np.float32)
     assert sender.dropped == 0
+
+
+def test_what_follows_soon_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(priorities, "_GATHER_S", 0.5)
+    writer = FakeWriter()
+    with sending(writer) as sender:
+        put(sender, 1, 2, 3)
+        assert writer.next().keys.tolist() == [10, 11, 20, 21, 30, 31]
 
 
 def test_what_waits_is_one_message_in_order() -> None:
