@@ -6,7 +6,6 @@ are dropped and counted (harmless: the next draw of a transition brings a newer 
 """
 
 import threading
-import time
 from collections import deque
 
 import numpy as np
@@ -16,6 +15,7 @@ from common.trajectory import Int64Array, Priorities
 from services.replay.client import PriorityWriter
 
 _GATHER_S = 0.01  # that a message waits for more batches: it costs more than what is in it
+_GATHER_BATCHES = 16  # are enough
 
 
 class PrioritiesSender:
@@ -50,7 +50,8 @@ class PrioritiesSender:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append((keys, td_errors))
-            self._changed.notify()
+            if len(self._waiting) in (1, _GATHER_BATCHES):
+                self._changed.notify()
 
     def close(self) -> None:
         """End the thread after the message under way; what waits is dropped."""
@@ -77,8 +78,9 @@ class PrioritiesSender:
         """All that waits, a moment after there is something; None when closing."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing or self._waiting)
-        time.sleep(_GATHER_S)
-        with self._changed:
+            self._changed.wait_for(
+                lambda: self._closing or len(self._waiting) >= _GATHER_BATCHES, _GATHER_S
+            )
             if self._closing:
                 return None
             batches = list(self._waiting)

@@ -74,6 +74,15 @@ def test_what_follows_soon_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
         assert writer.next().keys.tolist() == [10, 11, 20, 21, 30, 31]
 
 
+def test_enough_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(priorities, "_GATHER_S", 2 * _DEADLINE_S)
+    monkeypatch.setattr(priorities, "_GATHER_BATCHES", 3)
+    writer = FakeWriter()
+    with sending(writer) as sender:
+        put(sender, 1, 2, 3)
+        assert len(writer.next().keys) == 6
+
+
 def test_what_waits_is_one_message_in_order() -> None:
     writer = FakeWriter()
     with sending(writer) as sender:
