@@ -17,14 +17,21 @@ from common.errors import TransportError
 class Publisher:
     """Puts bytes on one key."""
 
-    def __init__(self, publisher: Any) -> None:
+    def __init__(self) -> None:
+        self._publisher: Any = None
+
+    def attach(self, publisher: Any) -> None:
+        """Go on with this one of Zenoh's."""
         self._publisher = publisher
 
     def put(self, payload: bytes) -> None:
         """Publish; what nobody subscribes to is lost without an error."""
+        publisher = self._publisher
         try:
-            self._publisher.put(payload)
+            publisher.put(payload)
         except zenoh.ZError as error:
+            if publisher is not self._publisher:  # the session was renewed meanwhile
+                return self.put(payload)
             raise TransportError(f"cannot publish: {error}") from error
 
 

@@ -263,14 +263,16 @@ class PendingReply:
 class Client:
     """Sends queries to one key; any number may be under way, all of one thread."""
 
-    def __init__(
-        self, querier: Any, whom: str, timeout_s: float, max_message_bytes: int, lender: Lender
-    ) -> None:
-        self._querier = querier
+    def __init__(self, whom: str, timeout_s: float, max_message_bytes: int, lender: Lender) -> None:
+        self._querier: Any = None
         self._whom = whom
         self._timeout_s = timeout_s
         self._max_bytes = max_message_bytes
         self._lender = lender
+
+    def attach(self, querier: Any) -> None:
+        """Go on with this one of Zenoh's."""
+        self._querier = querier
 
     def ask(self, payload: Part | Sequence[Part], *, reply_bytes: int = 0) -> PendingReply:
         """Send a query, given whole or in parts; its answer is waited for with `result`.
@@ -290,11 +292,17 @@ class Client:
         pending = PendingReply(self._whom, self._timeout_s, self._max_bytes, self._lender, slot)
         handler = zenoh.handlers.Callback(pending.offer, pending.end, indirect=False)
         message = _over_network(parts, far=self._lender.near is False)
-        try:
-            self._querier.get(handler, payload=message, attachment=attachment)
-        except zenoh.ZError as error:
-            raise TransportError(f"cannot ask {self._whom}: {error}") from error
+        self._get(handler, message, attachment)
         return pending
+
+    def _get(self, handler: Any, message: bytes, attachment: str | None) -> None:
+        querier = self._querier
+        try:
+            querier.get(handler, payload=message, attachment=attachment)
+        except zenoh.ZError as error:
+            if querier is not self._querier:  # the session was renewed meanwhile
+                return self._get(handler, message, attachment)
+            raise TransportError(f"cannot ask {self._whom}: {error}") from error
 
     def _lend(self, size: int) -> Slot | None:
         """A slot for a large message, or a first one to see whether the peer can open it."""

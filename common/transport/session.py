@@ -10,7 +10,10 @@ import json
 import logging
 import re
 import socket
+import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,7 @@ from common.transport.slots import Lender
 
 ROUTER_FILE = Path(str(resources.files("configs"))) / "router.json5"
 _LOG = logging.getLogger("transport")
+_TRY_AGAIN_S = 0.2
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _ENCRYPTED = "tls/"
 _LOOPBACK = re.compile(r"[a-z]+/(127\.|\[::1\]|localhost:)")
@@ -49,8 +53,25 @@ _CLIENT_SETTINGS: dict[str, Any] = {
 }
 
 
+@dataclass(slots=True)
+class _Declaration:
+    """What is declared on whichever of Zenoh's sessions is there."""
+
+    make: Callable[[zenoh.Session], Any]
+    use: Callable[[Any], None]
+    declared: Any = None
+
+    def on(self, session: zenoh.Session) -> None:
+        self.declared = self.make(session)
+        self.use(self.declared)
+
+
 class Session(Closing):
     """An open Zenoh session: a router where it listens, a client otherwise.
+
+    A client whose link was lost goes on with a new session of Zenoh's, of another identity, on
+    which all is declared anew: what a router still clears away of the old link, it would take from
+    a new link of the same identity too, which then hears nothing any more (zenoh#1886).
 
     router_file: what to be as a router; by default configs/router.json5. `config` says where to
     listen and connect, if it says so at all.
@@ -76,44 +97,83 @@ class Session(Closing):
         how = _router_settings(config) if routes else _CLIENT_SETTINGS
         for key, value in (how | ends | _certificates(config)).items():
             settings.insert_json5(key, json.dumps(value))
+        self._settings = settings
+        self._declarations: list[_Declaration] = []
+        self._lock = threading.Lock()  # of what is declared, and where
+        self._renewing = threading.Lock()
+        self._closed = threading.Event()
         self._session = self._open(settings, time.monotonic() + open_timeout_s)
-        self._declared = contextlib.ExitStack()
+        self._listener: Any = None
         if self._listen:
             self._say_who_may_join()
+        else:
+            self._watch(self._session)
 
     def close(self) -> None:
         """Undeclare everything and close; again is harmless."""
-        with contextlib.suppress(zenoh.ZError):
-            self._declared.close()
-        if not self._session.is_closed():
-            self._session.close()  # type: ignore[no-untyped-call]
+        self._closed.set()
+        with self._renewing, self._lock:
+            declarations, self._declarations = self._declarations, []
+            for declaration in reversed(declarations):
+                with contextlib.suppress(zenoh.ZError):
+                    declaration.declared.undeclare()
+            if not self._session.is_closed():
+                self._session.close()  # type: ignore[no-untyped-call]
+
+    def _watch(self, session: zenoh.Session) -> None:
+        """Renew it once its link is lost."""
+
+        def offer(event: Any) -> None:
+            if event.kind == zenoh.SampleKind.DELETE and not self._closed.is_set():
+                threading.Thread(target=self._renew, args=(session,), name="renew").start()
+
+        handler = zenoh.handlers.Callback(offer, indirect=False)
+        self._listener = session.info.declare_transport_events_listener(handler)
+
+    def _renew(self, lost: zenoh.Session) -> None:
+        with self._renewing:
+            while not self._closed.is_set() and lost is self._session:
+                try:
+                    fresh = zenoh.open(self._settings)
+                except zenoh.ZError:
+                    self._closed.wait(_TRY_AGAIN_S)
+                    continue
+                self._watch(fresh)
+                with self._lock:
+                    self._session = fresh
+                    for declaration in self._declarations:
+                        declaration.on(fresh)
+                with contextlib.suppress(zenoh.ZError):
+                    lost.close()  # type: ignore[no-untyped-call]
 
     def publisher(self, key: str) -> Publisher:
         """A publisher whose `put` waits rather than drops when the link is full."""
-        declared = self._session.declare_publisher(
-            key, congestion_control=zenoh.CongestionControl.BLOCK
+        publisher = Publisher()
+        block = zenoh.CongestionControl.BLOCK
+        self._declare(
+            lambda on: on.declare_publisher(key, congestion_control=block), publisher.attach
         )
-        return Publisher(self._declare(declared))
+        return publisher
 
     def latest_subscriber(self, key: str) -> LatestSubscriber:
         """Keeps the newest publication only: older ones are overwritten."""
         latest = LatestSubscriber(self._config.max_message_bytes)
         handler = zenoh.handlers.Callback(latest.offer, indirect=False)
-        self._declare(self._session.declare_subscriber(key, handler))
+        self._declare(lambda on: on.declare_subscriber(key, handler))
         return latest
 
     def queue_subscriber(self, key: str, capacity: int = 4096) -> QueueSubscriber:
         """Keeps publications in order; when full, new ones are dropped and counted."""
         waiting = QueueSubscriber(self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(waiting.offer, indirect=False)
-        self._declare(self._session.declare_subscriber(key, handler))
+        self._declare(lambda on: on.declare_subscriber(key, handler))
         return waiting
 
     def server(self, key: str, capacity: int = 256) -> Server:
         """Answers queries on `key`; when `capacity` wait already, a new one is refused."""
         server = Server(self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(server.offer, indirect=False)
-        self._declare(self._session.declare_queryable(key, handler, complete=True))
+        self._declare(lambda on: on.declare_queryable(key, handler, complete=True))
         return server
 
     def client(
@@ -124,30 +184,38 @@ class Session(Closing):
         lends: large messages go through shared memory where the peer can reach it.
         """
         timeout = self._config.timeout_s if timeout_s is None else timeout_s
-        querier = self._session.declare_querier(
-            key,
-            target=zenoh.QueryTarget.BEST_MATCHING,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
-        )
         lender = Lender(whom, enabled=lends and self._config.shared_memory)
-        max_bytes = self._config.max_message_bytes
-        return Client(self._declare(querier), whom, timeout, max_bytes, lender)
+        client = Client(whom, timeout, self._config.max_message_bytes, lender)
+        self._declare(
+            lambda on: on.declare_querier(
+                key,
+                target=zenoh.QueryTarget.BEST_MATCHING,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout,
+            ),
+            client.attach,
+        )
+        return client
 
     def announce(self, key: str) -> None:
         """Hold a liveliness token on `key` for as long as the session is open."""
-        self._declare(self._session.liveliness().declare_token(key))
+        self._declare(lambda on: on.liveliness().declare_token(key))
 
     def presence(self, key: str) -> "Presence":
         """Follows the liveliness tokens on `key`, those already there included."""
         presence = Presence()
         handler = zenoh.handlers.Callback(presence.offer, indirect=False)
-        self._declare(self._session.liveliness().declare_subscriber(key, handler, history=True))
+        self._declare(lambda on: on.liveliness().declare_subscriber(key, handler, history=True))
         return presence
 
-    def _declare(self, declared: Any) -> Any:
-        self._declared.callback(declared.undeclare)
-        return declared
+    def _declare(
+        self, make: Callable[[zenoh.Session], Any], use: Callable[[Any], None] = lambda _: None
+    ) -> None:
+        """make: declares it on a session of Zenoh's. use: takes what that gave, each time."""
+        declaration = _Declaration(make, use)
+        with self._lock:
+            declaration.on(self._session)
+            self._declarations.append(declaration)
 
     def _open(self, settings: zenoh.Config, deadline: float) -> zenoh.Session:
         while True:

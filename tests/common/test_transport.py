@@ -502,3 +502,43 @@ def test_a_linked_router_waits_for_the_other() -> None:
             Session(TransportConfig(connect=(first,))) as peer,
         ):
             until_served(peer, KEY, server)
+
+
+def test_a_client_whose_link_was_lost_goes_on_as_another() -> None:
+    """With all that it declared; a router may still clear away what the old link left."""
+    endpoint = free_endpoint()
+    router = Session(TransportConfig(listen=(endpoint,)))
+    config = TransportConfig(connect=(endpoint,), timeout_s=5.0)
+    with Session(config) as one, Session(config) as other:
+        server, client = one.server(KEY), other.client(KEY, "the peer")
+        latest, queue = one.latest_subscriber("test/latest"), one.queue_subscriber("test/queue")
+        publishers = other.publisher("test/latest"), other.publisher("test/queue")
+        one.announce(KEYS.live("actor", "a"))
+        presence = other.presence(KEYS.everyone())
+        until_served(other, KEY, server)
+        identities = one._session.zid(), other._session.zid()
+        router.close()
+        with Session(TransportConfig(listen=(endpoint,))):
+            eventually(lambda: (one._session.zid(), other._session.zid()) != identities)
+            until_served(other, KEY, server)
+            assert one._session.zid() != identities[0]
+            assert other._session.zid() != identities[1]
+            pending = client.ask(b"question")
+            assert answer_next(server, "reply", "answer") == b"question"
+            assert pending.result() == b"answer"
+            for publisher, subscriber in zip(publishers, (latest, queue), strict=True):
+                publisher.put(b"news")
+                assert subscriber.take(_DEADLINE_S) is not None
+            eventually(lambda: KEYS.live("actor", "a") in presence.alive())
+
+
+def test_closing_waits_for_no_router() -> None:
+    endpoint = free_endpoint()
+    router = Session(TransportConfig(listen=(endpoint,)))
+    session = Session(TransportConfig(connect=(endpoint,)))
+    session.server(KEY)
+    router.close()
+    began_s = time.monotonic()
+    session.close()
+    assert time.monotonic() - began_s < _DEADLINE_S
+    assert "closed" in repr(session)
