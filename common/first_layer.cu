@@ -1,7 +1,7 @@
 // The network's first layer on a GPU's tensor cores: convolution, max-pool and ReLU in one, and its gradient.
 //
 // Pictures come as bytes and only what is pooled leaves, 1 of 9 bytes that torch's operations move. A block
-// takes pictures one after the other. Whoever compiles it defines STACK and VIEW (common/device_first_layer.py).
+// takes pictures one after the other. Whoever compiles it defines STACK and VIEW (common/first_layer_cuda.py).
 // Greys and their gradients are multiplied in bfloat16 and added up in float32; a grey is exact in it.
 //
 // Words are two bfloat16 numbers each. In shared memory a row of a picture is WORDS of them. A window's 5 taps of

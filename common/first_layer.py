@@ -25,6 +25,11 @@ from common.trajectory import Float32Array, UInt8Array
 MOST_LIT: Final = 0.25  # of all pixels; with more, torch's operations are faster
 
 
+def pooled_px(view_px: int) -> int:
+    """Width of what the layer gives for pictures of this width, once it is pooled."""
+    return ((view_px - KERNEL) // 2 + 1) // 2
+
+
 @dataclass(frozen=True, slots=True)
 class LitPixels:
     """The pixels of states that are not black, row after row."""
@@ -91,7 +96,7 @@ _COLUMNS = np.argsort(TAPS).tolist()
 def _forward(lit: LitPixels, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     """The outputs, and which of the four each is the largest of, uint8; both [B, C, P, P]."""
     num, stack, size = lit.shape
-    side = ((size - KERNEL) // 2 + 1) // 2
+    side = pooled_px(size)
     pooled = torch.empty(num, side, side, CHANNELS)
     largest = torch.empty(num, side, side, CHANNELS, dtype=torch.uint8)
     taps = weight.detach().permute(1, 2, 3, 0)[:, :, list(TAPS)].contiguous()

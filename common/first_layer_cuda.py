@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from common.first_layer import pooled_px
 from common.kernels import KernelError, Launch, compile_kernel, source_of
 from common.lit_kernels import CHANNELS, KERNEL
 
@@ -40,7 +41,7 @@ class Layout:
 
     @property
     def pooled_px(self) -> int:
-        return ((self.view_px - KERNEL) // 2 + 1) // 2
+        return pooled_px(self.view_px)
 
     @property
     def sums(self) -> int:
