@@ -27,9 +27,10 @@ RUN pip --python /opt/mrcdrl/bin/python install --no-compile . \
 COPY common common
 COPY services services
 COPY configs configs
+COPY mrcdrl mrcdrl
 RUN pip --python /opt/mrcdrl/bin/python install --no-compile --no-deps --force-reinstall . \
- && /opt/mrcdrl/bin/python -c "import common.heartbeat, services.cli, services.replay.__main__, \
-      services.replay.inspect, services.router.__main__, services.train.status"
+ && /opt/mrcdrl/bin/python -c "import mrcdrl.cli, mrcdrl.common.runtime.heartbeat, mrcdrl.services.replay.main, \
+      mrcdrl.services.replay.inspect.main, mrcdrl.services.router.main, mrcdrl.services.status.main"
 
 FROM small-installed AS certs-installed
 RUN pip --python /opt/mrcdrl/bin/python install cryptography
@@ -41,6 +42,7 @@ RUN pip --python /opt/mrcdrl/bin/python install '.[arena,learn]'
 COPY common common
 COPY services services
 COPY configs configs
+COPY mrcdrl mrcdrl
 RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
 
 # -- what all have: no root, one folder to keep runs in, health by the work that is done -------------
@@ -62,7 +64,7 @@ USER mrcdrl
 ENTRYPOINT ["mrcdrl"]
 # Not working for 30 s is unhealthy; a main loop that hangs for 120 s is killed, and started again.
 HEALTHCHECK --interval=5s --timeout=5s --start-period=120s --retries=2 \
-    CMD ["python", "-m", "common.heartbeat", "--max-age", "30", "--kill-after", "120"]
+    CMD ["python", "-m", "mrcdrl.common.runtime.heartbeat", "--max-age", "30", "--kill-after", "120"]
 
 FROM service AS small
 COPY --from=small-installed /opt/mrcdrl /opt/mrcdrl
@@ -72,7 +74,7 @@ COPY --from=learning-installed /opt/mrcdrl /opt/mrcdrl
 # Compiled functions are kept here. Freed memory stays with the process, as with `mrcdrl train`.
 ENV NUMBA_CACHE_DIR=/var/cache/mrcdrl \
     MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4294967296 MALLOC_TOP_PAD_=67108864
-RUN python -m common.precompile
+RUN python -m mrcdrl.services.tools.precompile
 
 # -- one target a service -----------------------------------------------------------------------------
 

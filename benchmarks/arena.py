@@ -25,9 +25,9 @@ import torch
 
 from benchmarks.machine import emit, spread
 from benchmarks.stages import make_collector
-from common.arena import ArenaBatch, Scene, literal_views, make_codec
-from common.config import Config, load_config
-from common.trajectory import UInt8Array
+from mrcdrl.common.arena import ArenaBatch, Scene, literal_views, make_codec
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.messages.trajectory import UInt8Array
 
 PUSHT = Path(__file__).with_name("pusht.py")
 NUM_ACTIONS_DRAWN = 512  # steps after which the random actions repeat

@@ -4,7 +4,7 @@
 truncated, flipped, spliced, foreign, ill-fitting and oversized messages over Zenoh, also with
 their arrays after the map, and in sets. It prints one line of JSON: how many of each kind were
 refused, that all were counted, the reasons, messages/s, and the memory of the process (VmRSS) on
-the way. tests/system/test_system_bad_messages.py sends a few thousand.
+the way. tests/system/test_bad_messages.py sends a few thousand.
 """
 
 import argparse
@@ -23,14 +23,14 @@ import msgpack
 import numpy as np
 
 from benchmarks.machine import emit
-from common import wire
-from common.config import Config, TransportConfig, load_config, to_toml
-from common.errors import DeadlineError, HeldError, RefusedError, WireError
-from common.framing import join_set, split_set
-from common.keys import Keys
-from common.trajectory import Chunk, Priorities, Stats
-from common.transport import PendingReply, Session, free_endpoint
-from common.wire import SampleRequest, decode, encode
+from mrcdrl.common.config import Config, TransportConfig, load_config, to_toml
+from mrcdrl.common.errors import DeadlineError, RefusedError, ThrottledError, WireError
+from mrcdrl.common.messages import wire
+from mrcdrl.common.messages.framing import join_set, split_set
+from mrcdrl.common.messages.trajectory import Chunk, Priorities, SampleRequest, Stats
+from mrcdrl.common.messages.wire import decode, encode
+from mrcdrl.common.transport import PendingReply, Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
 IN_FLIGHT = 32
@@ -149,7 +149,7 @@ class Peer:
             kind, payload, reply = self._pending.popleft()
             try:
                 reply.result()
-            except HeldError as error:
+            except ThrottledError as error:
                 raise AssertionError(f"{kind} message held: {error}") from error
             except RefusedError as error:
                 if kind == "good":

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import emit, spread
-from common.config import load_config
+from mrcdrl.common.config import load_config
 from tests.chaos.chaos_faults import (
     cut_off,
     full,

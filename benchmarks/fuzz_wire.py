@@ -2,7 +2,7 @@
 
 `python -m benchmarks.fuzz_wire --minutes 10` runs libFuzzer (by Atheris, `pip install atheris`) in
 a process of its own, begins with a valid message of each class, and prints one line of JSON:
-executions, executions/s, coverage (edges of the bytecode of common/wire.py and framing.py, and
+executions, executions/s, coverage (edges of the bytecode of wire.py and framing.py, and
 features), findings. Sets of messages are taken apart too. What is taken must also encode to the
 same again. Exit code 1 where there is a finding.
 """
@@ -21,8 +21,8 @@ import msgpack
 import numpy as np
 
 from benchmarks.machine import emit
-from common.errors import WireError
-from common.framing import join_map, join_set, split_map
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.framing import join_map, join_set, split_map
 
 _DONE = re.compile(r"cov: (\d+) ft: (\d+) corp: (\d+)")
 _STAT = re.compile(r"^stat::(\w+):\s+(\d+)", re.M)
@@ -115,8 +115,8 @@ def examples() -> list[bytes]:
 
     Each once with its arrays in the map and once with them after it.
     """
-    from common import wire
-    from common.trajectory import Chunk
+    from mrcdrl.common.messages import wire
+    from mrcdrl.common.messages.trajectory import Chunk
 
     found = []
     for large_bytes in (wire._LARGE_BYTES, 1):
@@ -133,7 +133,7 @@ def example(cls: type) -> Any:
     from dataclasses import fields
     from typing import get_args, get_origin, get_type_hints
 
-    from common.trajectory import Outcome
+    from mrcdrl.common.messages.trajectory import Outcome
 
     plain = {
         int: 1,
@@ -164,11 +164,12 @@ def fuzz(arguments: list[str]) -> int:
         import atheris
     except ImportError:
         raise SystemExit("fuzz_wire needs Atheris: pip install atheris") from None
-    for name in ("common.framing", "common.wire"):  # to be read again, with what counts edges
+    names = ["mrcdrl.common.messages.framing", "mrcdrl.common.messages.wire"]
+    for name in names:  # to be read again, with what counts edges
         sys.modules.pop(name, None)
-    with atheris.instrument_imports(include=["common.framing", "common.wire"]):
-        from common import framing, wire
-    from common.trajectory import Chunk
+    with atheris.instrument_imports(include=names):
+        from mrcdrl.common.messages import framing, wire
+    from mrcdrl.common.messages.trajectory import Chunk
 
     classes = list(wire._SCHEMAS)
 

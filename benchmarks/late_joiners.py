@@ -23,11 +23,11 @@ from typing import Any
 
 from benchmarks.learner_kills import Follower
 from benchmarks.machine import emit, spread
-from common.config import TransportConfig
-from common.keys import Keys
-from common.live import LivePolicy
-from common.transport import Session, free_endpoint
-from services.train.fleet import ALLOCATOR
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.sync.live_policy import LivePolicy
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.train.fleet import ALLOCATOR
 from tests.system.system_processes import (
     REPOSITORY,
     Command,

@@ -9,7 +9,7 @@ are measured: on a GPU steps as learner.step = auto makes them beside eager ones
 forward passes, one backward, the optimiser, and reading back the absolute TD errors that
 prioritized replay wants (on a GPU those of the launch before, so that none is waited for). Our
 pictures are those of --robots playing at random in the default arena: what is black of them costs
-a CPU nothing (`common/first_layer.py`). `--pictures noise` has no black in it. Each system prints
+a CPU nothing (`sparse_conv.py`). `--pictures noise` has no black in it. Each system prints
 its line of JSON, round after round, with its share of what a large matrix product reaches with the
 same threads; then a table of medians goes to stderr. `--run DIR` adds how many
 transitions a second the learner of a recorded run consumed in its best minute, over Zenoh and
@@ -33,14 +33,14 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.machine import emit, seconds_per_call, spread
 from benchmarks.replay_peers import run
-from common.arena import ArenaBatch, make_codec
-from common.config import AgentConfig, ArenaConfig, LearnerConfig
-from common.network import Precision
-from common.process import ALLOCATOR
-from common.trajectory import NUM_ACTIONS
-from services.dashboard.records import METRICS
-from services.learner.batch import Batch
-from services.learner.learner import Learner
+from mrcdrl.common.arena import ArenaBatch, make_codec
+from mrcdrl.common.config import AgentConfig, ArenaConfig, LearnerConfig
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS
+from mrcdrl.common.model.q_network import Precision
+from mrcdrl.common.runtime.process import ALLOCATOR
+from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.monitor.records import METRICS
 
 _BATCHES = 8  # in turns, as the harness does
 _STACK, _VIEW_PX = 4, 60
@@ -74,7 +74,7 @@ def main() -> None:
     elif arguments.step or not (arguments.rounds and (arguments.peers or on_gpu(arguments))):
         emit(ours(arguments))
     else:
-        found = in_turns(arguments)
+        found = in_lockstep(arguments)
         for name, results in found.items():
             cells = (
                 f"b{size} {median(figure(r, size) for r in results):8.1f}"
@@ -83,7 +83,7 @@ def main() -> None:
             sys.stderr.write(f"{name:24}" + "   ".join(cells) + "\n")
 
 
-def in_turns(arguments: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+def in_lockstep(arguments: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     """Results by system, a round after the other; each is printed as it comes."""
     timing = [f"--{name}={getattr(arguments, name)}" for name in ("threads", "seconds", "reps")]
     module = [sys.executable, "-m", "benchmarks.learner", *timing, "--batches"]

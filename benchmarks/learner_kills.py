@@ -27,17 +27,17 @@ import numpy as np
 import torch
 
 from benchmarks.machine import emit
-from common.config import TransportConfig
-from common.files import RUN_CONFIG
-from common.keys import Keys
-from common.live import LivePolicy
-from common.network import weights_to_bytes
-from common.trajectory import Evaluation, Stats, Weights
-from common.transport import Session, free_endpoint
-from common.weights import WeightsReader
-from common.wire import decode
-from services.evaluator.__main__ import Judge
-from services.train.fleet import ALLOCATOR
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights
+from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.runtime.files import RUN_CONFIG
+from mrcdrl.common.sync.live_policy import LivePolicy
+from mrcdrl.common.sync.weights import WeightsReader
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.evaluator.evaluator import Judge
+from mrcdrl.services.train.fleet import ALLOCATOR
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
 SMALL_RUN = (

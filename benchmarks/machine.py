@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from services.dashboard.summary import machine, versions
+from mrcdrl.services.monitor.summary import machine, versions
 
 
 def seconds_per_call(work: Callable[[], object], *, seconds: float, repeats: int) -> list[float]:

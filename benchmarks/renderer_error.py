@@ -13,9 +13,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.machine import emit
-from common.arena import Scene, layout_for, literal_views, make_codec, training_start
-from common.config import ArenaConfig
-from common.trajectory import UInt8Array
+from mrcdrl.common.arena import Scene, layout_for, literal_views, make_codec, training_start
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import UInt8Array
 
 ORIENTATIONS = ("unrotated", "heading_up")
 LIMIT = 0.5  # grey levels

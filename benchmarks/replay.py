@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.machine import emit
-from common.process import ALLOCATOR
+from mrcdrl.common.runtime.process import ALLOCATOR
 
 HARNESS = "peers_harness"  # its own name, `common`, is that of a package of ours
 LINKED = "MRCDRL_BENCH_HARNESS"
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--request", type=int, default=512, help="transitions a sample request")
     parser.add_argument("--backlog", type=int, default=64, help="batches of priorities that wait")
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        (Path(folder) / f"{HARNESS}.py").symlink_to(peers_of(parser) / "common.py")
+        (Path(folder) / f"{HARNESS}.py").symlink_to(peers_of(parser) / "mrcdrl.common.py")
         (Path(folder) / "pool.npz").symlink_to(peers_of(parser) / "pool.npz")
         os.environ |= ALLOCATOR  # as `mrcdrl train` does for the processes it starts
         os.environ[LINKED] = folder

@@ -29,11 +29,11 @@ import numpy as np
 
 from benchmarks.machine import emit, spread
 from benchmarks.replay_load import counting_chunk
-from common.config import Config, TransportConfig, load_config, to_toml
-from common.errors import DeadlineError
-from common.keys import Keys
-from common.transport import Session, free_endpoint
-from services.replay.contents import Contents, log_directory, read_contents
+from mrcdrl.common.config import Config, TransportConfig, load_config, to_toml
+from mrcdrl.common.errors import DeadlineError
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay.inspect.contents import Contents, log_directory, read_contents
 from tests.system.system_processes import (
     REPOSITORY,
     Command,

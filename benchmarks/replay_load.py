@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from common.config import Config, TransportConfig, load_config
-from common.keys import Keys
-from common.process import StopSignal
-from common.trajectory import Chunk, Priorities, Samples
-from common.transport import Session
-from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
+from mrcdrl.common.config import Config, TransportConfig, load_config
+from mrcdrl.common.messages.trajectory import Chunk, Priorities, Samples
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
 
 _WARN_S = 60.0
 _MOST_CHUNKS = 6  # of one request

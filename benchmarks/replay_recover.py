@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import emit, spread
-from common.config import Config, load_config
-from common.trajectory import Chunk
-from common.wire import encode
-from services.replay.__main__ import build, open_log
-from services.replay.service import ReplayService
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.messages.trajectory import Chunk
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.services.replay.build import build, open_log
+from mrcdrl.services.replay.service import ReplayService
 
 
 class NoServer:

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from common.arena import make_codec
-from common.config import Config
-from common.keys import Keys
-from common.process import StopSignal, available_cores
-from common.trajectory import Chunk, Samples, UInt8Array
-from common.transport import Session
-from services.actor.sender import Sender
-from services.learner.drawing import ThreadedDecode
-from services.learner.priorities import PrioritiesSender
-from services.replay.__main__ import build, open_log
-from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
-from services.replay.service import ReplayService
+from mrcdrl.common.arena import make_codec
+from mrcdrl.common.config import Config
+from mrcdrl.common.messages.trajectory import Chunk, Samples, UInt8Array
+from mrcdrl.common.runtime.process import StopSignal, available_cores
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.actor.sender import Sender
+from mrcdrl.services.learner.priorities import PrioritiesSender
+from mrcdrl.services.learner.rendering import ThreadedDecoder
+from mrcdrl.services.replay.build import build, open_log
+from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
+from mrcdrl.services.replay.service import ReplayService
 
 sys.path.insert(0, os.environ["MRCDRL_BENCH_HARNESS"])
 base: Any = importlib.import_module("peers_harness")
@@ -143,7 +143,7 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
         super().begin(batch_size)
         self._threads = ThreadPoolExecutor(self.args.drawing_threads or available_cores())
         codec = make_codec(config_of(self.args).arena)
-        self._decode = ThreadedDecode(codec, VIEW_PX, self._threads)
+        self._decode = ThreadedDecoder(codec, VIEW_PX, self._threads)
         self._session = session_of(self.args, "connect")
         self._stop = StopSignal()
         batches = max(1, self.args.request // batch_size)
@@ -174,7 +174,7 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
             return samples.records.reshape(*samples.records.shape[:2], VIEW_PX, VIEW_PX)
         self._num_given += 1
         if self._num_given <= 3:
-            # Before it starts the clock the harness looks at shape, order and greys of three
+            # Before it starts the clock the harness looks at shape, order and intensities of three
             # batches: our arena is darker than its frames.
             return self._decode(samples.records) // 2 + np.uint8(120)
         return self._decode(samples.records) if self.args.codec == "drawn" else samples.records

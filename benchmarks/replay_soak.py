@@ -12,7 +12,6 @@ import multiprocessing.process
 import multiprocessing.queues
 import multiprocessing.synchronize
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -22,14 +21,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import emit
-from common.config import Config, load_config, to_toml
-from common.errors import MrcdrlError
-from common.keys import Keys
-from common.process import StopSignal
-from common.trajectory import Chunk, Priorities, Stats
-from common.transport import Session, free_endpoint
-from common.wire import decode
-from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
+from mrcdrl.common.config import Config, load_config, to_toml
+from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.trajectory import Chunk, Priorities, Stats
+from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.runtime.process import COMMAND, StopSignal
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
 
 RUN = "soak"
 LENGTH = 50
@@ -65,7 +64,7 @@ def soak(config: Config, arguments: argparse.Namespace, folder: Path) -> dict[st
     """All figures."""
     endpoint = free_endpoint()
     (folder / "config.toml").write_text(to_toml(config), "utf-8")
-    command = [sys.executable, "-m", "services.replay", "--run", RUN, "--listen", endpoint]
+    command = [*COMMAND, "replay", "--run", RUN, "--listen", endpoint]
     command += ["--config", str(folder / "config.toml"), "--run-dir", str(folder)]
     spawn = multiprocessing.get_context("spawn")
     stop, told = spawn.Event(), spawn.Queue()

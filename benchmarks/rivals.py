@@ -9,11 +9,11 @@ import dataclasses
 from itertools import product
 
 from benchmarks.machine import emit
-from common.arena.controllers import CONTROLLERS, check_controller
-from common.config import load_config
-from common.trajectory import Weights
-from services.evaluator.evaluate import judge
-from services.evaluator.subject import Subject
+from mrcdrl.common.arena.controllers import CONTROLLERS, check_controller
+from mrcdrl.common.config import load_config
+from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.services.tools.evaluate import judge
+from mrcdrl.services.tools.subject import Subject
 
 
 def main() -> None:

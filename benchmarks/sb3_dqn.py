@@ -16,15 +16,15 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from benchmarks.machine import emit
-from common.arena.sb3 import ArenaVecEnv
-from common.config import ArenaConfig
-from common.network import HIDDEN_UNITS, feature_size
+from mrcdrl.common.arena.envs.sb3 import ArenaVecEnv
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.model.q_network import HIDDEN_UNITS, feature_size
 
 ARENAS, ROBOTS, TRAIN_FREQUENCY, BATCH = 8, 2, 4, 32
 
 
 class PaperFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
-    """The convolutions of common/network.py, on pictures that stable-baselines3 made 0 … 1."""
+    """The convolutions of our network, on pictures that stable-baselines3 made 0 … 1."""
 
     def __init__(self, observation_space: object) -> None:
         super().__init__(observation_space, feature_size(60))

@@ -23,14 +23,14 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from benchmarks.machine import emit
 from benchmarks.sb3_dqn import ARENAS, BATCH, NETWORKS, ROBOTS, TRAIN_FREQUENCY
-from common.arena import test_starts
-from common.arena.codec import make_codec
-from common.arena.sb3 import ArenaVecEnv
-from common.config import ArenaConfig, Config, load_config
-from common.policy import Selection
-from common.schedule import value_at
-from common.trajectory import BoolArray, Float32Array, Outcome, UInt8Array
-from services.evaluator.trial import PER, PolicyPlayer, play
+from mrcdrl.common.arena import test_starts
+from mrcdrl.common.arena.envs.sb3 import ArenaVecEnv
+from mrcdrl.common.arena.images.codec import make_codec
+from mrcdrl.common.config import ArenaConfig, Config, load_config
+from mrcdrl.common.config.schedule import value_at
+from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, Outcome, UInt8Array
+from mrcdrl.common.model.policy import Selection
+from mrcdrl.services.evaluator.trial import PER, PolicyPlayer, play
 
 _TELL_UPDATES = 1_000
 _TEST_UPDATES = 2_500

@@ -11,21 +11,21 @@ import numpy as np
 import torch
 
 from benchmarks.machine import emit, seconds_per_call, spread
-from common.arena import ArenaBatch, layout_symmetries, make_codec
-from common.config import Config, TransportConfig, load_config
-from common.keys import Keys
-from common.policy import make_policy
-from common.process import StopSignal
-from common.trajectory import Chunk
-from common.transport import Session, free_endpoint
-from services.actor.chunker import Origin
-from services.actor.collector import Collector
-from services.learner.batch import collate
-from services.learner.drawing import make_drawing
-from services.learner.learner import Learner
-from services.replay.__main__ import build
-from services.replay.client import ReplayReader, ReplayWriter
-from services.replay.service import ReplayService
+from mrcdrl.common.arena import ArenaBatch, layout_symmetries, make_codec
+from mrcdrl.common.config import Config, TransportConfig, load_config
+from mrcdrl.common.messages.trajectory import Chunk
+from mrcdrl.common.model.policy import make_policy
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.actor.chunker import ChunkerConfig
+from mrcdrl.services.actor.collector import Collector
+from mrcdrl.services.learner.batch import collate
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.learner.rendering import make_renderer
+from mrcdrl.services.replay.build import build
+from mrcdrl.services.replay.client import ReplayReader, ReplayWriter
+from mrcdrl.services.replay.service import ReplayService
 
 MICRO = 1e6
 
@@ -54,7 +54,7 @@ def main() -> None:
 def make_collector(config: Config) -> Collector:
     rngs = [np.random.default_rng(i) for i in range(config.actor.num_arenas)]
     arenas = ArenaBatch(config.arena, rngs)
-    origin = Origin(
+    origin = ChunkerConfig(
         actor="bench",
         incarnation=1,
         gamma=config.agent.gamma,
@@ -125,7 +125,7 @@ def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> d
         service.stop()
     if sampled is None:
         raise RuntimeError("no mini-batch came")
-    draw = make_drawing(config.arena, learner.device)
+    draw = make_renderer(config.arena, learner.device)
     symmetries = layout_symmetries(config.arena)
 
     def collated() -> object:

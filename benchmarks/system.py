@@ -22,13 +22,13 @@ from typing import Any
 
 from benchmarks.machine import emit
 from benchmarks.replay_peers import run
-from common.config import Config, TransportConfig
-from common.keys import Keys
-from common.trajectory import Stats
-from common.transport import Session, free_endpoint
-from common.wire import decode
-from services.train.__main__ import num_actors
-from services.train.fleet import ALLOCATOR
+from mrcdrl.common.config import Config, TransportConfig
+from mrcdrl.common.messages.trajectory import Stats
+from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.train.fleet import ALLOCATOR
+from mrcdrl.services.train.main import num_actors
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
 TURNS = ("actors and evaluator", "actors", "alone")

@@ -1,1 +1,1 @@
-"""The nouns that cross a process boundary, each declared once."""
+"""What several processes share."""

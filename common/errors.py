@@ -9,9 +9,9 @@ MrcdrlError
 └── TransportError      the network did not do what was asked
     ├── EndpointError   an endpoint cannot be listened on or connected to
     ├── DeadlineError   a wait ended; the message says whom it waited for
-    ├── SlotError       memory that a peer lends is out of reach: the network must do
+    ├── SharedMemoryError       memory that a peer lends is out of reach: the network must do
     └── RefusedError    the peer answered, and refused, with its reason
-        └── HeldError   the peer's rate limiter held the request: try the same again
+        └── ThrottledError   the peer's rate limiter held the request: try the same again
 """
 
 
@@ -55,7 +55,7 @@ class DeadlineError(TransportError):
     """A wait ended without an answer; the message says whom it waited for."""
 
 
-class SlotError(TransportError):
+class SharedMemoryError(TransportError):
     """Memory that a peer lends is out of reach; the message is the reason."""
 
 
@@ -63,5 +63,5 @@ class RefusedError(TransportError):
     """The peer answered and refused; the message is its reason."""
 
 
-class HeldError(RefusedError):
+class ThrottledError(RefusedError):
     """The peer's rate limiter held the request for as long as it may; try the same again."""

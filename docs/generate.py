@@ -15,9 +15,9 @@ from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from common.config import Config, load_config, preset_names, sections, to_toml
-from services.actor.simulate import scaling
-from services.actor.simulate.scaling import Pace
+from mrcdrl.common.config import Config, load_config, preset_names, sections, to_toml
+from mrcdrl.services.tools.simulate import scaling
+from mrcdrl.services.tools.simulate.scaling import Pace
 
 TARGET = Path(__file__).with_name("configuration.md")
 SCALING = Path(__file__).with_name("scaling.md")
@@ -31,7 +31,7 @@ _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 _HEAD = """# Configuration
 
-<!-- Written by docs/generate.py from common/config.py and configs/: change those, then run it. -->
+<!-- Written by docs/generate.py from common/config/ and configs/: change those, then run it. -->
 
 One configuration serves all processes of a run. A flag beats an environment variable, which beats
 the file, which beats the default below:
@@ -192,7 +192,7 @@ def _needs() -> Iterator[str]:
         for pace in ("held", "free"):
             for actors in _ACTORS:
                 given = (
-                    Pace.held(config, actors, _RATE, _UPDATES)
+                    Pace.throttled(config, actors, _RATE, _UPDATES)
                     if pace == "held"
                     else Pace.free(actors, _RATE)
                 )
@@ -202,7 +202,9 @@ def _needs() -> Iterator[str]:
         {"learner.publish_precision": "bfloat16", "learner.publish_period": "500"},
         environ={},
     )
-    yield _need("`scene`, held, weights spared", spared, Pace.held(spared, 1000, _RATE, _UPDATES))
+    yield _need(
+        "`scene`, held, weights spared", spared, Pace.throttled(spared, 1000, _RATE, _UPDATES)
+    )
 
 
 def _need(title: str, config: Config, pace: Pace) -> str:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from common.arena import ArenaBatch, make_codec
-from common.live import LivePolicy
-from common.trajectory import Outcome
+from mrcdrl.common.arena import ArenaBatch, make_codec
+from mrcdrl.common.messages.trajectory import Outcome
+from mrcdrl.common.sync.live_policy import LivePolicy
 
 
 def main(run_dir: Path, episodes: int = 20) -> None:

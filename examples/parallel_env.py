@@ -4,23 +4,23 @@ import sys
 
 import cv2
 
-from common.arena.parallel_env import parallel_env
-from common.config import ArenaConfig
+from mrcdrl.common.arena.envs.parallel_env import parallel_env
+from mrcdrl.common.config import ArenaConfig
 
 
 def main(out: str, max_cycles: int = 150) -> None:
     env = parallel_env(ArenaConfig(num_robots=3), max_cycles=max_cycles, render_mode="rgb_array")
     env.reset(seed=7)
-    pictures, score = [], 0.0
+    images, score = [], 0.0
     while env.agents:
         actions = {agent: int(env.action_space(agent).sample()) for agent in env.agents}
         _, rewards, _, _, infos = env.step(actions)
         score += sum(rewards.values()) / len(rewards)
-        pictures.append(cv2.resize(env.render()[..., ::-1], (300, 300)))  # BGR
+        images.append(cv2.resize(env.render()[..., ::-1], (300, 300)))  # BGR
     animation = cv2.Animation()
-    animation.frames, animation.durations = pictures, [33] * len(pictures)
+    animation.frames, animation.durations = images, [33] * len(images)
     cv2.imwriteanimation(out, animation)
-    print(f"{infos['robot_0']['outcome']} after {len(pictures)} frames, score {score:.1f}")
+    print(f"{infos['robot_0']['outcome']} after {len(images)} frames, score {score:.1f}")
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ import sys
 from stable_baselines3 import DQN
 from stable_baselines3.common.vec_env import VecMonitor
 
-from common.arena.sb3 import ArenaVecEnv
-from common.config import ArenaConfig
+from mrcdrl.common.arena.envs.sb3 import ArenaVecEnv
+from mrcdrl.common.config import ArenaConfig
 
 
 def main(robot_steps: int, buffer_size: int = 100_000, learning_starts: int = 20_000) -> DQN:

@@ -1,1 +1,1 @@
-"""One folder a process; each `__main__` reads the configuration, wires by hand and runs."""
+"""The processes of a run, one folder each, and the commands around them."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from services.router.certs import HOSTS, ROLES
+from mrcdrl.services.tools.certs import HOSTS, ROLES
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 settings.register_profile("shared cores", deadline=None)  # a wait for a core is no slow example
@@ -17,7 +17,7 @@ settings.load_profile("shared cores")
 @pytest.fixture(scope="session")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of an authority and all roles, as `mrcdrl certs` makes it."""
-    from services.router.certificates import make  # only here is cryptography needed
+    from mrcdrl.services.tools.certificates import make  # only here is cryptography needed
 
     folder = tmp_path_factory.mktemp("certificates")
     make(folder, ROLES, HOSTS, datetime.timedelta(days=1))

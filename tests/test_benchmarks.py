@@ -42,10 +42,10 @@ def test_arena_measures_every_part_and_the_rival(
     rival = program(tmp_path / "python", "while read seconds; do echo 768; done")
     result = printed(monkeypatch, capsys, arena, *BRIEF, "--pusht-python", rival)
     parts = ("physics", "pymunk_physics", "drawing", "both", "literal_drawing", "literal_both")
-    names = {f"{part}_2_robot_steps_per_s" for part in parts} | {"pusht_pictures_per_s"}
+    names = {f"{part}_2_robot_steps_per_s" for part in parts} | {"pusht_images_per_s"}
     assert set(result["rates"]) == names
     assert all(rate["min"] > 0 for rate in result["rates"].values())
-    assert result["rates"]["pusht_pictures_per_s"]["median"] == 768
+    assert result["rates"]["pusht_images_per_s"]["median"] == 768
     (collecting,) = result["collecting"]
     assert sum(s for name, s in collecting.items() if name.endswith("_share")) == pytest.approx(
         1, abs=1e-3
@@ -90,10 +90,10 @@ def test_a_rival_that_ends_is_told_of(monkeypatch: pytest.MonkeyPatch, tmp_path:
 def test_renderer_error_knows_every_size_and_orientation(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    picture = tmp_path / "both.png"
+    image = tmp_path / "both.png"
     result = printed(
         monkeypatch, capsys, renderer_error,
-        "--scenes", 3, "--crops", 150, 600, "--picture", picture,
+        "--scenes", 3, "--crops", 150, 600, "--image", image,
     )  # fmt: skip
     errors = {(e["orientation"], e["crop_px"]): e for e in result["errors"]}
     assert set(errors) == {(o, c) for o in ("unrotated", "heading_up") for c in (150, 600)}
@@ -103,4 +103,4 @@ def test_renderer_error_knows_every_size_and_orientation(
         assert error["mean_abs"] <= error["mean_abs_where_not_black"] <= error["worst"]
         above = f"{error['orientation']} {error['crop_px']:g}" in result["above_limit"]
         assert above == (error["mean_abs"] > 0.5)
-    assert picture.stat().st_size > 10_000
+    assert image.stat().st_size > 10_000

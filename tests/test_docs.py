@@ -18,11 +18,10 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from common.arena.controllers import CONTROLLERS
-from common.config import Config, TransportConfig, load_config, preset_names
-from common.keys import Keys
-from common.network import QNetwork, weights_to_bytes
-from common.trajectory import (
+from mrcdrl import cli
+from mrcdrl.common.arena.controllers import CONTROLLERS
+from mrcdrl.common.config import Config, TransportConfig, load_config, preset_names
+from mrcdrl.common.messages.trajectory import (
     Chunk,
     EpisodeSummary,
     Evaluation,
@@ -32,26 +31,29 @@ from common.trajectory import (
     Outcome,
     Priorities,
     PrioritiesReply,
+    SampleRequest,
     Samples,
     Stats,
     Weights,
 )
-from common.transport import Session, free_endpoint
-from common.wire import SampleRequest, encode
-from services import cli
-from services.dashboard.recorder import EVALUATION_FIELDS, RATES, flat_metrics
-from services.dashboard.records import EpisodeRecord, EvaluationRecord
-from services.dashboard.state import RunState
-from services.dashboard.summary import summary
-from services.evaluator.navigation import Navigation, RobotNavigation
-from services.learner.learner import Learner
-from services.learner.meter import Meter
-from services.learner.vitals import Vitals
-from services.replay.__main__ import build
-from services.replay.contents import Contents
-from services.replay.digest import digest
-from services.replay.export import arrays
-from services.replay.service import ReplayService
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.evaluator.navigation import Navigation, RobotNavigation
+from mrcdrl.services.learner.diagnostics import Diagnostics
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.learner.timing import StageTimer
+from mrcdrl.services.monitor.recorder import EVALUATION_FIELDS, RATES, flat_metrics
+from mrcdrl.services.monitor.records import EpisodeRecord, EvaluationRecord
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.summary import summary
+from mrcdrl.services.replay.build import build
+from mrcdrl.services.replay.inspect.contents import Contents
+from mrcdrl.services.replay.inspect.export import arrays
+from mrcdrl.services.replay.inspect.summary import digest
+from mrcdrl.services.replay.service import ReplayService
 from tests.services.learner.test_learner import random_batch
 
 ROOT = Path(__file__).parents[1]
@@ -151,7 +153,7 @@ def test_message_is_documented(message: type) -> None:
 
 
 def test_schemas_are_documented() -> None:
-    from common.wire import _SCHEMAS
+    from mrcdrl.common.messages.wire import _SCHEMAS
 
     assert set(_SCHEMAS) == set(MESSAGES), "a message is missing in this test"
     for message, schema in _SCHEMAS.items():
@@ -237,10 +239,10 @@ def test_example_subscriber_runs(tmp_path: Path) -> None:
 # -- metrics -----------------------------------------------------------------------------
 
 METRICS_OF = {
-    "services/actor/__main__.py": "actor",
+    "services/actor/actor.py": "actor",
     "services/replay/service.py": "replay",
-    "services/learner/meter.py": "learner",
-    "services/evaluator/__main__.py": "evaluator",
+    "services/learner/timing.py": "learner",
+    "services/evaluator/evaluator.py": "evaluator",
 }
 
 
@@ -274,9 +276,11 @@ def published(role: str) -> set[str]:
         config = load_config(None, {"arena.view_px": "31", "learner.device": "cpu"})
         learner = Learner(config.agent, config.learner, stack=4, view_px=31)
         batch = random_batch(8)
-        meter = Meter(MagicMock(), MagicMock(), None, MagicMock(), Vitals(config, learner))
-        meter.last = (batch, learner.step(batch))
-        return set(meter.metrics())
+        timer = StageTimer(
+            MagicMock(), MagicMock(), None, MagicMock(), Diagnostics(config, learner)
+        )
+        timer.last = (batch, learner.step(batch))
+        return set(timer.metrics())
     return literal_keys(next(path for path, of in METRICS_OF.items() if of == role))
 
 
@@ -306,7 +310,7 @@ def test_run_files_are_documented() -> None:
 
 
 def test_tensorboard_tags_are_documented() -> None:
-    tree = ast.parse((ROOT / "services/dashboard/recorder.py").read_text("utf-8"))
+    tree = ast.parse((ROOT / "services/monitor/recorder.py").read_text("utf-8"))
     tags = {f"evaluation/{name}" for name in EVALUATION_FIELDS}
     tags |= {f"rates/{name}_per_s" for name in RATES} | {"learner/METRIC"}
     for node in ast.walk(tree):

@@ -1,6 +1,7 @@
-"""Who may import what: common no service, a service no other's inside, a library its place.
+"""Who may import what: rooms stand on floors, and a library is imported in its place only.
 
-Read off the source of every file, imports within functions included.
+Read off the source of every file, imports within functions included. docs/architecture.md draws
+the same floors.
 """
 
 import ast
@@ -13,58 +14,85 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
-    path.relative_to(ROOT) for top in ("common", "services") for path in (ROOT / top).rglob("*.py")
+    path.relative_to(ROOT)
+    for top in ("common", "services", "configs", "mrcdrl")
+    for path in (ROOT / top).rglob("*.py")
 )
+
+# From the ground up. A room may import itself and what stands on floors below its own.
+FLOORS = (
+    ("common/errors.py",),
+    ("common/config", "common/runtime"),
+    ("common/messages",),
+    ("common/transport", "common/arena"),
+    ("common/model",),
+    ("common/sync",),
+    # the processes of the ring; of one another they import the client only
+    (
+        "services/replay",
+        "services/actor",
+        "services/learner",
+        "services/evaluator",
+        "services/router",
+    ),
+    ("services/monitor",),
+    ("services/plots",),
+    ("services/train", "services/status", "services/tools"),
+    ("mrcdrl",),
+)
+HANDED_OUT = "client"  # the module of a process that others on its floor and above may import
+RING = FLOORS[6]
 
 # Where a library may be imported: a folder with all in it, or one file.
 PLACES = {
     "zenoh": ("common/transport",),
     "lz4": ("common/transport",),
-    "msgpack": ("common/wire.py",),
+    "msgpack": ("common/messages/wire.py",),
     "zlib_ng": ("services/replay/log.py",),
-    "pymunk": ("common/arena",),
-    "cv2": ("common/arena",),
-    "numba": ("common/arena", "common/lit_kernels.py"),
-    "llvmlite": ("common/lit_kernels.py",),
+    "pymunk": ("common/arena/world",),
+    "cv2": ("common/arena/images",),
+    "numba": ("common/arena", "common/model/kernels"),
+    "llvmlite": ("common/model/kernels",),
     "scipy": ("common/arena/controllers",),
-    "pettingzoo": ("common/arena/parallel_env.py",),
-    "gymnasium": ("common/arena/parallel_env.py", "common/arena/vector_env.py"),
-    "stable_baselines3": ("common/arena/sb3.py",),
-    "pydantic": ("common/config.py",),
+    "pettingzoo": ("common/arena/envs",),
+    "gymnasium": ("common/arena/envs",),
+    "stable_baselines3": ("common/arena/envs",),
+    "pydantic": ("common/config",),
     "torch": (
-        "common/first_layer.py",
-        "common/first_layer_cuda.py",
-        "common/kernels.py",
-        "common/network.py",
-        "common/policy.py",
-        "common/precompile.py",
+        "common/model",
         "services/learner",
         "services/actor",
         "services/evaluator",
+        "services/tools",
     ),
-    "cuda": ("common/kernels.py",),
-    "safetensors": ("common/network.py", "services/learner"),
-    "matplotlib": ("services/dashboard",),
-    "av": ("services/dashboard",),
-    "tensorboardX": ("services/dashboard",),
-    "onnxruntime": ("services/evaluator/export.py",),
-    "rerun": ("services/evaluator/recording.py",),
+    "cuda": ("common/model/kernels/cuda.py",),
+    "safetensors": ("common/model", "services/learner"),
+    "cryptography": ("services/tools/certificates.py",),
+    "matplotlib": ("services/plots",),
+    "av": ("services/plots",),
+    "tensorboardX": ("services/monitor",),
+    "onnxruntime": ("services/tools/export.py",),
+    "rerun": ("services/tools/rerun_recording.py",),
     "rich": (
-        "services/dashboard",
-        "services/train",
-        "services/doctor/__main__.py",
-        "services/evaluator",
-        "services/replay/inspect.py",
+        "services/monitor",
+        "services/status",
+        "services/tools",
+        "services/replay/inspect",
     ),
 }
 
-# The dashboard is no process: the launcher shows and records a run by its modules, the evaluator's
-# commands draw by them, and simulate names the machine as a run's summary does.
-DRAWN_BY_DASHBOARD = {
-    "services/actor": {"summary"},
-    "services/train": {"limiting", "recorder", "screen", "state", "stopping"},
-    "services/evaluator": {"figures", "film", "paper"},
-}
+
+def path_of(name: str) -> str:
+    """`mrcdrl.common.errors.X` as common/errors.py; a package as its folder."""
+    parts = name.split(".")[1:]
+    while parts:
+        path = Path(*parts)
+        if (ROOT / path).with_suffix(".py").is_file():
+            return path.with_suffix(".py").as_posix()
+        if (ROOT / path).is_dir():
+            return path.as_posix()
+        parts.pop()
+    return "mrcdrl"
 
 
 @cache
@@ -78,17 +106,25 @@ def imports_of(path: Path) -> frozenset[str]:
             assert node.level == 0, f"{path} imports relatively"
             assert node.module is not None
             names.add(node.module)
-            # `from services.learner import checkpoint` imports a module
-            names.update(
-                f"{node.module}.{alias.name}"
-                for alias in node.names
-                if (ROOT / node.module.replace(".", "/") / f"{alias.name}.py").is_file()
-            )
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
     return frozenset(names)
 
 
-def under(path: Path, places: tuple[str, ...]) -> bool:
-    return any(path == Path(place) or Path(place) in path.parents for place in places)
+def ours(path: Path) -> set[str]:
+    """Files and folders of ours that the file imports."""
+    return {path_of(name) for name in imports_of(path) if name.split(".")[0] == "mrcdrl"}
+
+
+def under(path: str | Path, places: tuple[str, ...]) -> bool:
+    return any(Path(path) == Path(place) or Path(place) in Path(path).parents for place in places)
+
+
+def room_and_floor(path: str | Path) -> tuple[str, int]:
+    for floor, rooms in enumerate(FLOORS):
+        for room in rooms:
+            if under(path, (room,)):
+                return room, floor
+    return "a package's face", -1  # common/, services/ and configs/ themselves hold docstrings only
 
 
 def by_name(path: Path) -> str:
@@ -96,39 +132,38 @@ def by_name(path: Path) -> str:
 
 
 def test_there_are_files_to_read() -> None:
-    assert Path("common/wire.py") in FILES
-    assert Path("services/train/__main__.py") in FILES
+    assert Path("common/messages/wire.py") in FILES
     assert "zenoh" in imports_of(Path("common/transport/session.py"))
-    assert "services.learner.checkpoint" in imports_of(Path("services/learner/keeper.py"))
+    assert "services/learner/checkpoint.py" in ours(Path("services/learner/weights_publisher.py"))
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if p.parts[0] == "common"], ids=by_name)
-def test_common_imports_no_service(path: Path) -> None:
-    assert {name for name in imports_of(path) if name.split(".")[0] == "services"} == set()
-
-
-@pytest.mark.parametrize("path", [p for p in FILES if len(p.parts) > 2], ids=by_name)
-def test_a_service_imports_of_another_its_client_only(path: Path) -> None:
-    if path.parts[0] != "services":
-        return
-    own = path.parts[1]
-    allowed = DRAWN_BY_DASHBOARD.get(f"services/{own}", set())
-    for name in imports_of(path):
-        parts = name.split(".")
-        if parts[0] != "services" or parts[1] == own:
+@pytest.mark.parametrize("path", FILES, ids=by_name)
+def test_imports_lead_to_the_floors_below(path: Path) -> None:
+    room, floor = room_and_floor(path)
+    for target in ours(path):
+        other, below = room_and_floor(target)
+        if other == room:
             continue
-        assert parts[2:] == ["client"] or (parts[1] == "dashboard" and parts[2] in allowed), (
-            f"{path} imports {name}"
-        )
+        client = other in RING and Path(target).stem == HANDED_OUT
+        assert below < floor or (client and room in RING), f"{path} imports {target}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=by_name)
+def test_every_file_stands_in_a_room(path: Path) -> None:
+    if room_and_floor(path)[1] < 0:
+        assert path.name == "__init__.py"
+        assert not imports_of(path), f"{path} stands on no floor and imports something"
+
+
+@pytest.mark.parametrize("path", FILES, ids=by_name)
+def test_no_module_imports_a_main_or_a_bare_name(path: Path) -> None:
+    for name in imports_of(path):
+        assert "__main__" not in name.split("."), f"{path} imports {name}"
+        assert name.split(".")[0] not in ("common", "services", "configs"), f"{path}: {name}"
 
 
 def test_the_command_imports_no_service_until_it_is_called() -> None:
-    ours = {
-        name
-        for name in imports_of(Path("services/cli.py"))
-        if name.split(".")[0] in ("common", "services")
-    }
-    assert ours == {"common.process"}
+    assert ours(Path("mrcdrl/cli.py")) == {"common/runtime/process.py"}
 
 
 @pytest.mark.parametrize("library", PLACES)
@@ -153,19 +188,21 @@ def modules_after(statement: str) -> set[str]:
 
 
 HEAVY = {"torch", "cv2", "numba", "pymunk", "matplotlib", "av", "safetensors", "rich"}
+LIGHT = {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}
 
 
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("services.replay.__main__", HEAVY),
-        ("services.cli", HEAVY),
-        ("services.replay.client", HEAVY),
-        ("services.train.__main__", {"torch", "safetensors"}),
-        ("services.train.status", HEAVY - {"rich"}),
-        ("services.actor.simulate.__main__", HEAVY),
-        ("services.doctor.__main__", HEAVY - {"rich"}),
-        ("common.heartbeat", {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}),
+        ("mrcdrl", LIGHT),
+        ("mrcdrl.cli", HEAVY),
+        ("mrcdrl.common.runtime.heartbeat", LIGHT),
+        ("mrcdrl.services.replay.main", HEAVY),
+        ("mrcdrl.services.replay.client", HEAVY),
+        ("mrcdrl.services.train.main", {"torch", "safetensors"}),
+        ("mrcdrl.services.status.main", HEAVY - {"rich"}),
+        ("mrcdrl.services.tools.simulate.main", HEAVY),
+        ("mrcdrl.services.tools.doctor.main", HEAVY - {"rich"}),
     ],
 )
 def test_what_a_module_brings_with_it(module: str, absent: set[str]) -> None:

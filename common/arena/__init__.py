@@ -1,12 +1,11 @@
-"""The paper's 2-D arena: physics, rewards, starts and the robots' pictures.
+"""The paper's 2-D arena: physics, rewards, starts and the robots' images.
 
 Invariants: the only package that imports pymunk or OpenCV; it knows of no network and no service.
 """
 
-from common.arena.arena import Arena
-from common.arena.batch import ArenaBatch, make_arenas
-from common.arena.codec import FrameCodec, ObservationCodec, SceneCodec, make_codec
-from common.arena.counting import (
+from mrcdrl.common.arena.arena import Arena
+from mrcdrl.common.arena.batch import ArenaBatch, make_arenas
+from mrcdrl.common.arena.counting import (
     Counters,
     CountingArena,
     CountingBatch,
@@ -15,15 +14,16 @@ from common.arena.counting import (
     counting_reward,
     decode_counters,
 )
-from common.arena.layout import fixed_layout, layout_for, layout_symmetries
-from common.arena.physics import ArrayPhysics, Physics
-from common.arena.pymunk_physics import PymunkPhysics
-from common.arena.rendering import draw_arena, literal_views
-from common.arena.rewards import frame_rewards, target_distances_px
-from common.arena.scene import LEFT, RIGHT, STRAIGHT, Layout, Scene, Start
-from common.arena.starts import test_starts, training_start
-from common.arena.symmetry import IDENTITY, SYMMETRIES, Symmetry
-from common.arena.views import AnalyticViews
+from mrcdrl.common.arena.images.codec import FrameCodec, ObservationCodec, SceneCodec, make_codec
+from mrcdrl.common.arena.images.rendering import literal_views, render_arena
+from mrcdrl.common.arena.images.views import AnalyticViews
+from mrcdrl.common.arena.world.layout import fixed_layout, layout_for, layout_symmetries
+from mrcdrl.common.arena.world.physics import ArrayPhysics, Physics
+from mrcdrl.common.arena.world.pymunk_physics import PymunkPhysics
+from mrcdrl.common.arena.world.rewards import frame_rewards, target_distances_px
+from mrcdrl.common.arena.world.scene import LEFT, RIGHT, STRAIGHT, Layout, Scene, Start
+from mrcdrl.common.arena.world.starts import test_starts, training_start
+from mrcdrl.common.arena.world.symmetry import IDENTITY, SYMMETRIES, Symmetry
 
 __all__ = [
     "IDENTITY",
@@ -51,7 +51,6 @@ __all__ = [
     "counting_outcome",
     "counting_reward",
     "decode_counters",
-    "draw_arena",
     "fixed_layout",
     "frame_rewards",
     "layout_for",
@@ -59,6 +58,7 @@ __all__ = [
     "literal_views",
     "make_arenas",
     "make_codec",
+    "render_arena",
     "target_distances_px",
     "test_starts",
     "training_start",

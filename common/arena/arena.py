@@ -6,10 +6,10 @@ Invariants: those of common.arena.batch, of which it is a batch of one.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from common.arena.batch import ArenaBatch
-from common.arena.scene import Scene, Start
-from common.config import ArenaConfig
-from common.trajectory import TimeStep
+from mrcdrl.common.arena.batch import ArenaBatch
+from mrcdrl.common.arena.world.scene import Scene, Start
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import TimeStep
 
 
 class Arena:

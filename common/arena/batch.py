@@ -10,17 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from common.arena.actions import checked_actions
-from common.arena.counting import CountingBatch
-from common.arena.layout import layout_for
-from common.arena.physics import ArrayPhysics, Physics
-from common.arena.pymunk_physics import PymunkPhysics
-from common.arena.rewards import frame_rewards
-from common.arena.scene import Scene, Start
-from common.arena.sensors import Sensors
-from common.arena.starts import training_start
-from common.config import ArenaConfig
-from common.trajectory import (
+from mrcdrl.common.arena.counting import CountingBatch
+from mrcdrl.common.arena.images.sensors import Sensors
+from mrcdrl.common.arena.world.layout import layout_for
+from mrcdrl.common.arena.world.physics import ArrayPhysics, Physics
+from mrcdrl.common.arena.world.pymunk_physics import PymunkPhysics
+from mrcdrl.common.arena.world.rewards import frame_rewards
+from mrcdrl.common.arena.world.scene import Scene, Start, checked_actions
+from mrcdrl.common.arena.world.starts import training_start
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import (
     BoolArray,
     Int64Array,
     Outcome,
@@ -168,7 +167,7 @@ class ArenaBatch:
 def make_arenas(
     config: ArenaConfig, rngs: Sequence[np.random.Generator], identities: Sequence[int]
 ) -> ArenaBatch | CountingBatch:
-    """The arenas that config.kind names; identities is what counting arenas' pictures carry."""
+    """The arenas that config.kind names; identities is what counting arenas' images carry."""
     if config.kind == "counting":
         return CountingBatch(config, identities)
     return ArenaBatch(config, rngs)

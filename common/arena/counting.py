@@ -1,6 +1,6 @@
-"""An arena whose pictures say which they are, so that a test proves none is torn or misplaced.
+"""An arena whose images say which they are, so that a test proves none is torn or misplaced.
 
-Invariants: everything is a function of (identity, episode, step), actions play no part; a picture
+Invariants: everything is a function of (identity, episode, step), actions play no part; an image
 repeats its counters from the first pixel to the last, and a magic byte tells it from an empty one.
 """
 
@@ -10,10 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from common.arena.actions import checked_actions
-from common.arena.scene import Scene, Start
-from common.config import ArenaConfig
-from common.trajectory import Int64Array, Outcome, StepType, TimeStep, TimeSteps, UInt8Array
+from mrcdrl.common.arena.world.scene import Scene, Start, checked_actions
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import (
+    Int64Array,
+    Outcome,
+    StepType,
+    TimeStep,
+    TimeSteps,
+    UInt8Array,
+)
 
 _MAGIC = 0xC5
 _COUNTERS = np.dtype(
@@ -24,7 +30,7 @@ _LONGEST = 23
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """What pictures [..., V, V] say of themselves."""
+    """What images [..., V, V] say of themselves."""
 
     identity: Int64Array  # [...]
     robot: Int64Array  # [...]
@@ -48,7 +54,7 @@ def counting_reward(episode: int, step: int) -> float:
 
 
 class CountingArena:
-    """The interface of Arena, with counters for pictures."""
+    """The interface of Arena, with counters for images."""
 
     def __init__(self, config: ArenaConfig, *, identity: int = 0) -> None:
         if not 0 <= identity < 2**16:
@@ -142,17 +148,17 @@ class CountingBatch:
         )
 
 
-def decode_counters(pictures: UInt8Array) -> Counters:
-    """The counters of pictures [..., V, V]; raises ValueError if one contradicts itself."""
-    leading = pictures.shape[:-2]
-    pixels = np.ascontiguousarray(pictures).reshape(-1, pictures.shape[-2] * pictures.shape[-1])
+def decode_counters(images: UInt8Array) -> Counters:
+    """The counters of images [..., V, V]; raises ValueError if one contradicts itself."""
+    leading = images.shape[:-2]
+    pixels = np.ascontiguousarray(images).reshape(-1, images.shape[-2] * images.shape[-1])
     marks = np.ascontiguousarray(pixels[:, : _COUNTERS.itemsize])
     repeats = -(-pixels.shape[1] // _COUNTERS.itemsize)
     whole = (np.tile(marks, repeats)[:, : pixels.shape[1]] == pixels).all(axis=1)
     counters = marks.view(_COUNTERS)[:, 0]
     torn = ~whole | (counters["magic"] != _MAGIC)
     if torn.any():
-        raise ValueError(f"{int(torn.sum())} of {len(torn)} pictures are torn or none of ours")
+        raise ValueError(f"{int(torn.sum())} of {len(torn)} images are torn or none of ours")
 
     def field(name: str) -> Int64Array:
         return counters[name].astype(np.int64).reshape(leading)

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import lz4.block
 
-from common.errors import WireError
-from common.framing import Part
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.framing import Part
 
 _HEAD = struct.Struct("<4sI")
 _MARK = b"\xc1lz4"

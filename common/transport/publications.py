@@ -11,7 +11,7 @@ from typing import Any
 
 import zenoh
 
-from common.errors import TransportError
+from mrcdrl.common.errors import TransportError
 
 
 class Publisher:

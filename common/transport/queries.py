@@ -25,17 +25,17 @@ from typing import Any
 
 import zenoh
 
-from common.errors import (
+from mrcdrl.common.errors import (
     DeadlineError,
-    HeldError,
     RefusedError,
-    SlotError,
+    SharedMemoryError,
+    ThrottledError,
     TransportError,
     WireError,
 )
-from common.framing import Part
-from common.transport.compression import compressed, expanded
-from common.transport.slots import LARGE_BYTES, Lender, Slot, Slots, put, room
+from mrcdrl.common.messages.framing import Part
+from mrcdrl.common.transport.compression import compressed, expanded
+from mrcdrl.common.transport.shared_memory import LARGE_BYTES, Lender, Slot, Slots, put, room
 
 _HELD = "held: "
 _FAR = "far: "
@@ -62,8 +62,8 @@ class Request:
     def open(self, slots: Slots, max_message_bytes: int) -> None:
         """Reach for the slot that the client lends, if it does.
 
-        Raises SlotError where the payload is in a slot that is out of reach, WireError where it is
-        compressed and damaged.
+        Raises SharedMemoryError where the payload is in a slot that is out of reach, WireError
+        where it is compressed and damaged.
         """
         if isinstance(self.payload, bytes):
             self.payload = expanded(self.payload, max_message_bytes)
@@ -76,9 +76,9 @@ class Request:
         offer = _OFFER.fullmatch(said)
         try:
             if offer is None:
-                raise SlotError("no offer of a slot")
+                raise SharedMemoryError("no offer of a slot")
             self._memory = slots.open(offer[1])
-        except SlotError as error:
+        except SharedMemoryError as error:
             if offer is not None and offer[2]:
                 raise
             self._near, self._far = f"{_FAR}{error}", True
@@ -108,7 +108,7 @@ class Request:
         """The peer's request is wrong; asking again would not help."""
         self._answer(lambda: self._query.reply_err(reason.encode()))
 
-    def hold(self, reason: str) -> None:
+    def throttle(self, reason: str) -> None:
         """Not now; the peer is to ask again."""
         self.refuse(_HELD + reason)
 
@@ -136,7 +136,7 @@ class Server:
         self._bytes = 0
         self._slots = Slots()
         self.refused = 0  # because they were too large
-        self.held = 0  # because too many waited
+        self.throttled = 0  # because too many waited
 
     def offer(self, query: Any) -> None:
         """For Zenoh's callback."""
@@ -152,8 +152,8 @@ class Server:
                 self._bytes += size
                 self._waiting.put_nowait((request, size))
         if full:
-            self.held += 1
-            request.hold(f"{self._waiting.qsize()} requests are waiting")
+            self.throttled += 1
+            request.throttle(f"{self._waiting.qsize()} requests are waiting")
 
     def take(self, timeout_s: float) -> Request | None:
         """The next request; None where none came within `timeout_s`."""
@@ -165,7 +165,7 @@ class Server:
             self._bytes -= size
         try:
             request.open(self._slots, self._max_bytes)
-        except SlotError as error:
+        except SharedMemoryError as error:
             request.cannot_open(str(error))
             return None
         except WireError as error:
@@ -212,7 +212,7 @@ class PendingReply:
     def result(self) -> Part:
         """The reply's payload, valid until `release`.
 
-        Raises HeldError or RefusedError for a refusal, DeadlineError where no reply came,
+        Raises ThrottledError or RefusedError for a refusal, DeadlineError where no reply came,
         WireError where it is compressed and damaged.
         """
         self._ended.wait(max(self._deadline - time.monotonic(), 0.0))
@@ -227,9 +227,9 @@ class PendingReply:
         self.release()
         if text.startswith(_FAR):
             self._lender.refused(text.removeprefix(_FAR))
-            raise HeldError(text)
+            raise ThrottledError(text)
         if text.startswith(_HELD):
-            raise HeldError(text.removeprefix(_HELD))
+            raise ThrottledError(text.removeprefix(_HELD))
         raise RefusedError(f"{self._whom} refused: {text}")
 
     def release(self) -> None:
@@ -252,7 +252,7 @@ class PendingReply:
             if near and near[1] and self._slot is not None:
                 start, length = int(near[1]), int(near[2])
                 return _within(self._slot.memory, start, length, self._max_bytes)
-        except SlotError as error:
+        except SharedMemoryError as error:
             raise RefusedError(f"the answer of {self._whom}: {error}") from error
         self.release()
         if len(sample.payload) > self._max_bytes:
@@ -320,5 +320,5 @@ def _over_network(parts: Sequence[Part], *, far: bool) -> bytes:
 
 def _within(memory: memoryview, start: int, length: int, max_bytes: int) -> memoryview:
     if start + length > len(memory) or length > max_bytes:
-        raise SlotError(f"{length} bytes at {start} of a slot of {len(memory)}")
+        raise SharedMemoryError(f"{length} bytes at {start} of a slot of {len(memory)}")
     return memory[start : start + length]

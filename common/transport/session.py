@@ -20,14 +20,19 @@ from typing import Any
 
 import zenoh
 
-from common.closing import Closing
-from common.config import TransportConfig
-from common.errors import ConfigError, EndpointError
-from common.transport.publications import LatestSubscriber, Presence, Publisher, QueueSubscriber
-from common.transport.queries import Client, Server
-from common.transport.slots import Lender
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.errors import ConfigError, EndpointError
+from mrcdrl.common.runtime.closing import Closing
+from mrcdrl.common.transport.publications import (
+    LatestSubscriber,
+    Presence,
+    Publisher,
+    QueueSubscriber,
+)
+from mrcdrl.common.transport.queries import Client, Server
+from mrcdrl.common.transport.shared_memory import Lender
 
-ROUTER_FILE = Path(str(resources.files("configs"))) / "router.json5"
+ROUTER_FILE = Path(str(resources.files("mrcdrl.configs"))) / "router.json5"
 _LOG = logging.getLogger("transport")
 _TRY_AGAIN_S = 0.2
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")

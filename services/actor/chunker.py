@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from common.trajectory import Chunk, Float32Array, UInt8Array
+from mrcdrl.common.messages.trajectory import Chunk, Float32Array, UInt8Array
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
+class ChunkerConfig:
     """Who makes the chunks, and how they are cut.
 
     prioritized: whether chunks bear priorities; they are then cut one step later, when the value
@@ -41,7 +41,7 @@ class Origin:
 class Chunker:
     """The stream of one robot; `start` at each episode, `add` at each step."""
 
-    def __init__(self, origin: Origin) -> None:
+    def __init__(self, origin: ChunkerConfig) -> None:
         self._origin = origin
         self._history = origin.stack - 1
         self._records: list[UInt8Array] = []

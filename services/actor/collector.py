@@ -1,6 +1,6 @@
 """Many arenas stepped together: one batched inference for all of their robots.
 
-Invariants: the policy sees pictures drawn from the very records that go to replay; no thread,
+Invariants: the policy sees images drawn from the very records that go to replay; no thread,
 clock for decisions, or transport; each arena's exploration is its own.
 """
 
@@ -10,11 +10,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common.arena import ArenaBatch, CountingBatch, ObservationCodec
-from common.config import Config
-from common.policy import FrameStack, Policy
-from common.trajectory import Chunk, EpisodeSummary, Float32Array, TimeStep, UInt8Array
-from services.actor.chunker import Chunker, Origin
+from mrcdrl.common.arena import ArenaBatch, CountingBatch, ObservationCodec
+from mrcdrl.common.config import Config
+from mrcdrl.common.messages.trajectory import (
+    Chunk,
+    EpisodeSummary,
+    Float32Array,
+    TimeStep,
+    UInt8Array,
+)
+from mrcdrl.common.model.policy import FrameStack, Policy
+from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
 
 
 @dataclass(slots=True)
@@ -44,7 +50,7 @@ class Collector:
     def __init__(
         self,
         config: Config,
-        origin: Origin,
+        origin: ChunkerConfig,
         arenas: ArenaBatch | CountingBatch,
         codec: ObservationCodec,
         policy: Policy,

@@ -11,11 +11,11 @@ import logging
 import math
 import time
 
-from common.errors import TransportError, WireError
-from common.keys import Keys
-from common.trajectory import NO_SLOT, LeaseReply, LeaseRequest
-from common.transport import PendingReply, Session
-from common.wire import decode, encode
+from mrcdrl.common.errors import TransportError, WireError
+from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseReply, LeaseRequest
+from mrcdrl.common.messages.wire import decode, encode
+from mrcdrl.common.transport import PendingReply, Session
+from mrcdrl.common.transport.keys import Keys
 
 _LOG = logging.getLogger("actor")
 _SURE = 0.9  # share of a lease that is over by no clock: two need not run alike

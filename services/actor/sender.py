@@ -9,9 +9,9 @@ import queue
 import threading
 from collections.abc import Callable, Sequence
 
-from common.process import StopSignal
-from common.trajectory import Chunk
-from services.replay.client import ReplayWriter
+from mrcdrl.common.messages.trajectory import Chunk
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.services.replay.client import ReplayWriter
 
 _POLL_S = 0.2
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arena import Scene
-from common.arena.controllers import shortest_assignment
-from common.trajectory import BoolArray, Float64Array, Outcome
+from mrcdrl.common.arena import Scene
+from mrcdrl.common.arena.controllers import shortest_assignment
+from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, Outcome
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.trajectory import Evaluation, Outcome, Weights
-from services.evaluator.trial import PER, EpisodeResult
+from mrcdrl.common.messages.trajectory import Evaluation, Outcome, Weights
+from mrcdrl.services.evaluator.trial import PER, EpisodeResult
 
 _Z95 = 1.959964  # of the normal distribution
 

@@ -11,12 +11,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.arena import ArenaBatch, ObservationCodec, Scene, Start
-from common.arena.controllers import Controller
-from common.config import ArenaConfig
-from common.policy import FrameStack, Policy
-from common.trajectory import NUM_ACTIONS, Float64Array, Outcome, TimeStep, UInt8Array
-from services.evaluator.navigation import Journey, journey
+from mrcdrl.common.arena import ArenaBatch, ObservationCodec, Scene, Start
+from mrcdrl.common.arena.controllers import Controller
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import (
+    NUM_ACTIONS,
+    Float64Array,
+    Outcome,
+    TimeStep,
+    UInt8Array,
+)
+from mrcdrl.common.model.policy import FrameStack, Policy
+from mrcdrl.services.evaluator.navigation import Journey, journey
 
 _MAX_ARENAS = 64
 PER = 100  # episodes a block of Table 2
@@ -52,7 +58,7 @@ class Player(Protocol):
 
 
 class PolicyPlayer:
-    """Plays from pictures alone."""
+    """Plays from images alone."""
 
     def __init__(
         self,
@@ -80,8 +86,8 @@ class PolicyPlayer:
         return selection.actions.reshape(len(arenas), self._num_robots)
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
-        pictures = self._codec.decode(records.reshape(-1, records.shape[-1]))
-        self._frames.push(pictures, self._robots(arenas))
+        images = self._codec.decode(records.reshape(-1, records.shape[-1]))
+        self._frames.push(images, self._robots(arenas))
 
     def _robots(self, arenas: NDArray[np.int64]) -> NDArray[np.int64]:
         robots: NDArray[np.int64] = arenas[:, None] * self._num_robots + np.arange(self._num_robots)

@@ -1,10 +1,10 @@
 """From sampled records to the tensors of one learner step.
 
-Invariants: every record is drawn once; a transition's pictures and its action undergo the same
-symmetry; stacking states out of single pictures happens here only.
+Invariants: every record is drawn once; a transition's images and its action undergo the same
+symmetry; stacking states out of single images happens here only.
 
-Shapes: B = transitions, W = records a transition may touch, R = bytes of a record, S = pictures
-stacked in a state, V = width of a picture in px.
+Shapes: B = transitions, W = records a transition may touch, R = bytes of a record, S = images
+stacked in a state, V = width of an image in px.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +14,12 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from common.arena import Symmetry
-from common.config import ReplayConfig
-from common.errors import WireError
-from common.schedule import value_at
-from common.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples
-from services.learner.drawing import Drawing, Turns, to_device
+from mrcdrl.common.arena import Symmetry
+from mrcdrl.common.config import ReplayConfig
+from mrcdrl.common.config.schedule import value_at
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples
+from mrcdrl.services.learner.rendering import Renderer, SymmetryRows, to_device
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def importance_weights(samples: Samples, beta: float) -> Float32Array:
 
 def collate(
     samples: Samples,
-    draw: Drawing,
+    draw: Renderer,
     stack: int,
     *,
     symmetries: Sequence[Symmetry] = (),
@@ -79,21 +79,21 @@ def collate(
     Raises WireError if an action or a bootstrap offset is outside what the records hold.
     """
     _check(samples, stack)
-    turns = _drawn(symmetries, rng, len(samples))
+    symmetry_rows = _drawn(symmetries, rng, len(samples))
     actions = samples.actions.copy()
-    for symmetry, rows in turns:
+    for symmetry, rows in symmetry_rows:
         actions[rows] = symmetry.apply_to_actions(actions[rows])
-    pictures = draw(samples.records, turns)
-    device = pictures.device
+    images = draw(samples.records, symmetry_rows)
+    device = images.device
     offsets = to_device(samples.bootstrap_offsets.astype(np.int64), device)
     each = torch.arange(len(samples), device=device)[:, None]
     window = offsets[:, None] + torch.arange(stack, device=device)
     return Batch(
-        observation=pictures[:, :stack],
+        observation=images[:, :stack],
         action=to_device(actions.astype(np.int64), device),
         reward=to_device(samples.rewards.astype(np.float32), device),
         discount=to_device(samples.discounts.astype(np.float32), device),
-        next_observation=pictures[each, window],
+        next_observation=images[each, window],
         importance_weights=to_device(importance_weights(samples, beta), device),
         keys=samples.keys.copy(),  # the samples are valid for a while only
     )
@@ -109,7 +109,9 @@ def _check(samples: Samples, stack: int) -> None:
         raise WireError(f"a transition needs {last} records and has {width}")
 
 
-def _drawn(symmetries: Sequence[Symmetry], rng: np.random.Generator | None, num: int) -> Turns:
+def _drawn(
+    symmetries: Sequence[Symmetry], rng: np.random.Generator | None, num: int
+) -> SymmetryRows:
     """One symmetry for each of num rows; none where there are none."""
     if not symmetries:
         return ()

@@ -16,9 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common.errors import CheckpointError
-from common.files import TEMPORARY_SUFFIX, reason, sha256, sync_directory, write_synced
-from services.learner.learner import LearnerState
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.runtime.files import (
+    TEMPORARY_SUFFIX,
+    reason,
+    sha256,
+    sync_directory,
+    write_synced,
+)
+from mrcdrl.services.learner.learner import LearnerState
 
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"

@@ -15,26 +15,22 @@ import torch
 from safetensors.torch import save as write_safetensors
 from torch import Tensor
 
-from common.config import AgentConfig, LearnerConfig
-from common.errors import CheckpointError, ConfigError, DivergedError
-from common.network import (
-    SENT_AS,
-    Operands,
-    QNetwork,
-    Trace,
-    load_weights,
-    precision,
-    read_arrays,
-    resolve_device,
-    weights_to_bytes,
+from mrcdrl.common.config import AgentConfig, LearnerConfig
+from mrcdrl.common.config.schedule import value_at
+from mrcdrl.common.errors import CheckpointError, ConfigError, DivergedError
+from mrcdrl.common.model.q_network import Operands, QNetwork, Trace, precision, resolve_device
+from mrcdrl.common.model.weights_io import SENT_AS, load_weights, read_arrays, weights_to_bytes
+from mrcdrl.services.learner.accelerate.cuda_graphs import CudaGraphs, Recorder, Recording
+from mrcdrl.services.learner.accelerate.data_parallel import Slices
+from mrcdrl.services.learner.accelerate.optimizer import (
+    MOMENTS,
+    Descent,
+    Gradients,
+    gradients,
+    leaves,
 )
-from common.schedule import value_at
-from services.learner.batch import Batch
-from services.learner.descent import MOMENTS, Descent, Gradients, gradients, leaves
-from services.learner.launch import CudaGraphs, Recorder, Recording
-from services.learner.slices import Slices
-from services.learner.targets import double_dqn_target, dqn_target, td_loss
-from services.learner.update import Update
+from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.learner.loss import Update, double_dqn_target, dqn_target, td_loss
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ import threading
 import time
 from collections.abc import Callable
 
-from common.errors import WireError
-from common.process import StopSignal
-from common.trajectory import Samples
-from services.learner.batch import Batch
-from services.replay.client import ReplayReader
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.trajectory import Samples
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.replay.client import ReplayReader
 
 _LOG = logging.getLogger("learner")
 _POLL_S = 0.2

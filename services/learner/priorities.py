@@ -11,8 +11,8 @@ from collections import deque
 import numpy as np
 import torch
 
-from common.trajectory import Int64Array, Priorities
-from services.replay.client import PriorityWriter
+from mrcdrl.common.messages.trajectory import Int64Array, Priorities
+from mrcdrl.services.replay.client import PriorityWriter
 
 _GATHER_S = 0.01  # that a message waits for more batches: it costs more than what is in it
 _GATHER_BATCHES = 16  # are enough

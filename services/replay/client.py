@@ -8,15 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import DeadlineError, HeldError, WireError
-from common.framing import join_set
-from common.keys import Keys
-from common.process import StopSignal
-from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples
-from common.transport import Client, PendingReply, Session
-from common.wire import SampleRequest, decode, encode, encode_parts
-from services.replay.shards import ShardStream, shard_of, shares
-from services.replay.size import table_bytes
+from mrcdrl.common.errors import DeadlineError, ThrottledError, WireError
+from mrcdrl.common.messages.framing import join_set
+from mrcdrl.common.messages.trajectory import (
+    Chunk,
+    InsertReply,
+    Priorities,
+    PrioritiesReply,
+    SampleRequest,
+    Samples,
+)
+from mrcdrl.common.messages.wire import decode, encode, encode_parts
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport import Client, PendingReply, Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay.build import table_bytes
+from mrcdrl.services.replay.shards import ShardStream, shard_of, shares
 
 __all__ = [
     "PriorityWriter",
@@ -54,7 +61,7 @@ class ReplayWriter:
         self._client = session.client(keys.insert(shard), name, lends=True)
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
-        self.held = 0
+        self.throttled = 0
         """Answers that said: not now."""
         self.unanswered = 0
         """Requests whose time was over, or that brought no reply one could read."""
@@ -81,8 +88,8 @@ class ReplayWriter:
                 reply = decode(InsertReply, pending.result())
                 pending.release()
                 return reply
-            except HeldError:
-                self.held += 1
+            except ThrottledError:
+                self.throttled += 1
                 self._patience.renew()
                 if time.monotonic() - asked_s < _RETRY_S:  # too many wait there already
                     self._stop.wait(retry_s)
@@ -124,13 +131,13 @@ class ReplayReader:
         """
         self._batches_per_request = batches_per_request
         self._learner_step = -1 if learner_step is None else learner_step
-        in_turns = learner_step is not None
+        in_lockstep = learner_step is not None
         self._shards = [
             ShardStream(
                 session.client(keys.sample(shard), name, lends=True),
                 name,
                 self._request,
-                1 if in_turns else requests_in_flight,
+                1 if in_lockstep else requests_in_flight,
             )
             for shard, name in enumerate(_names(num_shards))
         ]
@@ -173,7 +180,7 @@ class ReplayReader:
             return iter(())
         try:
             samples = drawn.take()
-        except HeldError:
+        except ThrottledError:
             self._patience.renew()
             return iter(())
         except DeadlineError:
@@ -235,7 +242,7 @@ class PriorityWriter:
             return None
         try:
             return decode(PrioritiesReply, pending.result())
-        except (HeldError, DeadlineError, WireError):
+        except (ThrottledError, DeadlineError, WireError):
             return None
 
 

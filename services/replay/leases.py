@@ -10,7 +10,7 @@ import bisect
 from dataclasses import dataclass
 from itertools import chain
 
-from common.trajectory import NO_SLOT, LeaseReply, LeaseRequest
+from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseReply, LeaseRequest
 
 MAX_SLOTS = 4096  # where the configuration sets no number
 Holder = tuple[str, int]

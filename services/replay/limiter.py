@@ -7,7 +7,7 @@ Invariant: once `min_size` is reached, samples stay within `error_buffer` of
 import math
 from dataclasses import dataclass
 
-from common.errors import ConfigError
+from mrcdrl.common.errors import ConfigError
 
 
 @dataclass(slots=True)

@@ -19,9 +19,9 @@ from pathlib import Path
 
 from zlib_ng import zlib_ng  # ten times as fast as zlib
 
-from common.errors import RunDirectoryError
-from common.files import reason, sync_directory
-from common.framing import Part
+from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.messages.framing import Part
+from mrcdrl.common.runtime.files import reason, sync_directory
 
 _LOG = logging.getLogger("replay")
 _HEADER = struct.Struct("<II")

@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from common.trajectory import Float32Array, Float64Array, Int64Array
-from services.replay.sum_tree import SumTree
+from mrcdrl.common.messages.trajectory import Float32Array, Float64Array, Int64Array
+from mrcdrl.services.replay.sum_tree import SumTree
 
 _EPSILON = 1e-6  # so that a transition without any error is drawn now and then
 

@@ -14,18 +14,24 @@ from typing import Protocol
 
 import numpy as np
 
-from common.config import Config
-from common.errors import WireError
-from common.files import reason
-from common.framing import Part, split_set
-from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply
-from common.turns import Turns
-from common.wire import SampleRequest, decode, encode, encode_parts
-from services.replay.limiter import RateLimiter
-from services.replay.log import SegmentLog
-from services.replay.sequence import Arrival, SequenceBook
-from services.replay.snapshot import Snapshot, SnapshotWriter, read_snapshot
-from services.replay.table import Table
+from mrcdrl.common.config import Config
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.framing import Part, split_set
+from mrcdrl.common.messages.trajectory import (
+    Chunk,
+    InsertReply,
+    Priorities,
+    PrioritiesReply,
+    SampleRequest,
+)
+from mrcdrl.common.messages.wire import decode, encode, encode_parts
+from mrcdrl.common.runtime.files import reason
+from mrcdrl.common.sync.lockstep import Lockstep
+from mrcdrl.services.replay.limiter import RateLimiter
+from mrcdrl.services.replay.log import SegmentLog
+from mrcdrl.services.replay.sequence import Arrival, SequenceBook
+from mrcdrl.services.replay.snapshot import Snapshot, SnapshotWriter, read_snapshot
+from mrcdrl.services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
 _TAKE_S = 0.2  # how soon a thread sees that it is to stop
@@ -47,7 +53,7 @@ class _Request(Protocol):
     def room(self, size: int) -> memoryview | None: ...
     def reply(self, payload: Part | Sequence[Part]) -> None: ...
     def refuse(self, reason: str) -> None: ...
-    def hold(self, reason: str) -> None: ...
+    def throttle(self, reason: str) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +94,7 @@ class ReplayService:
         self._snapshots = (
             None if log is None else SnapshotWriter(log.directory, self.snapshot, period_s)
         )
-        self._turns = Turns.of(config)
+        self._lockstep = Lockstep.of(config)
         self._book = SequenceBook()
         self._accepted: list[_Accepted] = []  # neither logged nor stored yet
         self._owed: list[tuple[_Request, InsertReply]] = []  # once all of them are
@@ -232,7 +238,7 @@ class ReplayService:
                 continue
             why_not = self._why_not_admitted(request, chunk)
             if why_not:
-                request.hold(why_not)
+                request.throttle(why_not)
                 return
             before = self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
             self._accepted.append(_Accepted(message, chunk, arrival, before))
@@ -249,7 +255,7 @@ class ReplayService:
             for each in reversed(accepted):
                 self._book.take_back(each.chunk.actor, each.chunk.incarnation, each.before)
             for request, _ in owed:
-                request.hold(why_not)
+                request.throttle(why_not)
             return why_not
         if accepted:
             with self._changed:
@@ -332,9 +338,9 @@ class ReplayService:
             raise WireError(f"batch_size {size} is outside 1 ... {self._limiter.largest_sample}")
         with self._changed:
             if not self._wait("sample_held", request, lambda: self._can_sample(asked)):
-                request.hold(self._why_no_sample())
+                request.throttle(self._why_no_sample())
                 return
-            if self._turns is not None:
+            if self._lockstep is not None:
                 seeds = (self._config.replay.seed, asked.learner_step)
                 self._table.sampler.rng = np.random.default_rng(seeds)
             samples = self._table.sample(size, request.room(self._table.sample_bytes(size)))
@@ -344,11 +350,11 @@ class ReplayService:
 
     def _can_sample(self, asked: SampleRequest) -> bool:
         """Raises WireError where it asks for what is not to be had any more, or never was."""
-        if self._turns is None:
+        if self._lockstep is None:
             return self._limiter.can_sample(asked.batch_size)
         if asked.learner_step < 0:
             raise WireError("a run that takes turns is asked for the samples of a learner step")
-        inserts, due = self._table.next_key, self._turns.inserts(asked.learner_step)
+        inserts, due = self._table.next_key, self._lockstep.inserts(asked.learner_step)
         if inserts > due:
             raise WireError(
                 f"{inserts} transitions where {due} are due at learner step {asked.learner_step}: "

@@ -12,10 +12,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from common.errors import DeadlineError, HeldError
-from common.trajectory import Float64Array, Samples
-from common.transport import Client, PendingReply
-from common.wire import decode
+from mrcdrl.common.errors import DeadlineError, ThrottledError
+from mrcdrl.common.messages.trajectory import Float64Array, Samples
+from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.transport import Client, PendingReply
 
 _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2
@@ -76,15 +76,15 @@ class ShardStream:
     def take(self) -> Samples:
         """The answer that is ready; its arrays are valid until the next call, or `release`.
 
-        Raises HeldError where the shard holds back, DeadlineError where it is away, RefusedError
-        with its reason.
+        Raises ThrottledError where the shard holds back, DeadlineError where it is away,
+        RefusedError with its reason.
         """
         self.release()
         pending = self._pending.popleft()
         try:
             payload = pending.result()
             samples = decode(Samples, payload)
-        except HeldError:
+        except ThrottledError:
             self.late = True
             raise
         except DeadlineError:

@@ -20,13 +20,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from common.config import Config
-from common.errors import CheckpointError
-from common.files import TEMPORARY_SUFFIX, atomic_write, reason
-from common.trajectory import Float32Array, Float64Array
-from services.replay.limiter import RateLimiter
-from services.replay.sampler import priorities_of
-from services.replay.table import Table
+from mrcdrl.common.config import Config
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.trajectory import Float32Array, Float64Array
+from mrcdrl.common.runtime.files import TEMPORARY_SUFFIX, atomic_write, reason
+from mrcdrl.services.replay.limiter import RateLimiter
+from mrcdrl.services.replay.sampler import priorities_of
+from mrcdrl.services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
 _NAME = "snapshot"

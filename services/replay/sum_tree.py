@@ -10,7 +10,7 @@ drawn. Pure numpy: each call works on all its indices at once, level by level.
 
 import numpy as np
 
-from common.trajectory import Float64Array, Int64Array
+from mrcdrl.common.messages.trajectory import Float64Array, Int64Array
 
 NODE_BYTES = 8
 MAX_NODES = 4  # for each value

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.errors import ConfigError, WireError
-from common.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
-from services.replay.sampler import Sampler
+from mrcdrl.common.errors import ConfigError, WireError
+from mrcdrl.common.messages.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
+from mrcdrl.services.replay.sampler import Sampler
 
 _COLUMNS_BYTES = 4 + 1 + 4 + 1 + 4 + 4 + 1 + 8  # of one transition
 _TAILS = 0.8  # kept at once for each full chunk: episodes have some 1.25 chunks, or more

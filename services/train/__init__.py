@@ -1,1 +1,1 @@
-"""`mrcdrl train`: starts a run's services on this machine, shows it, records it, ends it."""
+"""`mrcdrl train`: starts a run's services on this machine, watches them and ends them."""

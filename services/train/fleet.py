@@ -8,15 +8,14 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.config import ENV_PREFIX
-from common.errors import DivergedError, MrcdrlError
-from common.process import ALLOCATOR, DIE_WITH_PARENT
+from mrcdrl.common.config import ENV_PREFIX
+from mrcdrl.common.errors import DivergedError, MrcdrlError
+from mrcdrl.common.runtime.process import ALLOCATOR, COMMAND, DIE_WITH_PARENT
 
 _LOG = logging.getLogger("train")
 _TERM_S = 20.0  # until a service that was asked to stop is killed
@@ -40,7 +39,7 @@ class Service:
     log_read: int = field(default=0)
 
     def start(self) -> None:
-        command = [sys.executable, "-m", f"services.{self.role}", *self.arguments]
+        command = [*COMMAND, self.role, *self.arguments]
         environment = {**ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: str(os.getpid())}
         with self.log_path.open("ab") as log:
             self.process = subprocess.Popen(

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from common.config import Config, TransportConfig
-from common.keys import Keys
-from common.trajectory import Stats, Weights
-from common.transport import Session
-from common.wire import decode
-from services.replay.contents import Contents, log_directory, read_contents
+from mrcdrl.common.config import Config, TransportConfig
+from mrcdrl.common.messages.trajectory import Stats, Weights
+from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay.inspect.contents import Contents, log_directory, read_contents
 from tests.chaos.chaos_stack import Stack
 
 WORK = {  # role: the figure that rises while it does its work

@@ -17,9 +17,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.config import Config, to_toml
-from common.heartbeat import FILE_VARIABLE, Pulse
-from common.process import DIE_WITH_PARENT, STOP_DEADLINE_S
+from mrcdrl.common.config import Config, to_toml
+from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Pulse
+from mrcdrl.common.runtime.process import DIE_WITH_PARENT, STOP_DEADLINE_S
 from tests.chaos.chaos_faults import disk
 from tests.chaos.chaos_hosts import Host, Network, hosts
 from tests.system.system_processes import Command, run_name

@@ -12,10 +12,10 @@ from unittest.mock import MagicMock
 import pytest
 
 from benchmarks.replay_load import counting_chunk
-from common.config import load_config
-from common.trajectory import Stats, Weights
-from common.wire import encode
-from services.replay.contents import Contents
+from mrcdrl.common.config import load_config
+from mrcdrl.common.messages.trajectory import Stats, Weights
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.services.replay.inspect.contents import Contents
 from tests.chaos.chaos_faults import (
     cut_off,
     disk,

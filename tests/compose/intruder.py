@@ -15,12 +15,13 @@ from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 
-from common.config import TransportConfig
-from common.errors import DeadlineError, EndpointError, HeldError
-from common.keys import Keys
-from common.transport import Session
-from common.wire import SampleRequest, encode
-from services.router.certificates import make
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.errors import DeadlineError, EndpointError, ThrottledError
+from mrcdrl.common.messages.trajectory import SampleRequest
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.tools.certificates import make
 
 HOST, PORT = "router", 7447
 CERTIFICATES = Path("/certs")
@@ -89,7 +90,7 @@ def samples_as_an_evaluator(_: Path) -> None:
         while not sampled and time.monotonic() < until_s:
             try:
                 sampled = bool(allowed.ask(request).result())
-            except (DeadlineError, HeldError):  # not joined yet, or ahead of the actors
+            except (DeadlineError, ThrottledError):  # not joined yet, or ahead of the actors
                 continue
         assert sampled, "the learner gets no samples"
         with refused(DeadlineError):

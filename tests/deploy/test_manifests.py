@@ -13,8 +13,8 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from common.config import load_config
-from common.keys import check_name
+from mrcdrl.common.config import load_config
+from mrcdrl.common.runtime.names import check_name
 
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy"
@@ -32,6 +32,7 @@ WORKLOADS = {
     o["metadata"]["name"]: o for o in OBJECTS if o["kind"] in ("Deployment", "StatefulSet")
 }
 PODS: dict[str, Object] = {n: o["spec"]["template"] for n, o in WORKLOADS.items()}
+HEARTBEAT = "mrcdrl.common.runtime.heartbeat"
 workloads = pytest.mark.parametrize("name", WORKLOADS)
 
 
@@ -130,7 +131,7 @@ def test_health_is_judged_as_in_the_image(name: str) -> None:
     assert service["readinessProbe"]["exec"]["command"] == yaml.safe_load(healthcheck[1])
     assert PODS[name]["spec"]["shareProcessNamespace"] is True, "a process 1 is not to be killed"
     for probe in ("livenessProbe", "startupProbe"):
-        assert service[probe]["exec"]["command"][:3] == ["python", "-m", "common.heartbeat"]
+        assert service[probe]["exec"]["command"][:3] == ["python", "-m", HEARTBEAT]
     composed = COMPOSE["services"][name]["stop_grace_period"]
     assert f"{PODS[name]['spec']['terminationGracePeriodSeconds']}s" == composed
 

@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 import uuid
@@ -17,11 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from mrcdrl.common.runtime.process import COMMAND
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 PATIENCE_S = 300.0  # a machine under load takes so long for what takes five seconds on an idle one
 T = TypeVar("T")
 
-# Every part at its smallest: pictures of 32 px, short episodes.
+# Every part at its smallest: images of 32 px, short episodes.
 SMALL = (
     "--arena.view_px=32",
     "--arena.max_frames=30",
@@ -59,7 +60,7 @@ class Command:
         self.err_path = folder / f"{arguments[0]}-{label}.err"
         with self.out_path.open("wb") as out, self.err_path.open("wb") as err:
             self.process = subprocess.Popen(
-                [*prefix, sys.executable, "-m", "services.cli", *map(str, arguments)],
+                [*prefix, *COMMAND, *map(str, arguments)],
                 stdin=subprocess.DEVNULL if terminal is None else terminal,
                 stdout=out if terminal is None else terminal,
                 stderr=err if terminal is None else terminal,

@@ -9,13 +9,13 @@ import difflib
 
 import numpy as np
 
-from common.arena.controllers.heading import Controller, shortest_assignment
-from common.arena.controllers.nearest import greedy_actions, random_actions
-from common.arena.controllers.orca import Orca
-from common.arena.controllers.potential_field import PotentialField
-from common.arena.controllers.safe_circle import SafeCircle
-from common.config import ArenaConfig
-from common.errors import ConfigError
+from mrcdrl.common.arena.controllers.heading import Controller, shortest_assignment
+from mrcdrl.common.arena.controllers.nearest import greedy_actions, random_actions
+from mrcdrl.common.arena.controllers.orca import Orca
+from mrcdrl.common.arena.controllers.potential_field import PotentialField
+from mrcdrl.common.arena.controllers.safe_circle import SafeCircle
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.errors import ConfigError
 
 __all__ = [
     "CONTROLLERS",

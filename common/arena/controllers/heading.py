@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from common.arena.rewards import target_distances_px
-from common.arena.scene import STRAIGHT, Scene
-from common.config import ArenaConfig
-from common.trajectory import NUM_ACTIONS, Float64Array, Int64Array, UInt8Array
+from mrcdrl.common.arena.world.rewards import target_distances_px
+from mrcdrl.common.arena.world.scene import STRAIGHT, Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float64Array, Int64Array, UInt8Array
 
 Controller = Callable[[Scene], UInt8Array]
 """Actions [K] for a scene; one controller plays one episode."""

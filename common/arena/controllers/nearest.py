@@ -5,11 +5,11 @@ Invariants: pure functions of the scene and the injected generator.
 
 import numpy as np
 
-from common.arena.controllers.heading import actions_towards, bearings_rad
-from common.arena.rewards import target_distances_px
-from common.arena.scene import Scene
-from common.config import ArenaConfig
-from common.trajectory import NUM_ACTIONS, Int64Array, UInt8Array
+from mrcdrl.common.arena.controllers.heading import actions_towards, bearings_rad
+from mrcdrl.common.arena.world.rewards import target_distances_px
+from mrcdrl.common.arena.world.scene import Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Int64Array, UInt8Array
 
 
 def random_actions(scene: Scene, rng: np.random.Generator) -> UInt8Array:

@@ -12,16 +12,16 @@ import math
 
 import numpy as np
 
-from common.arena.controllers.heading import (
+from mrcdrl.common.arena.controllers.heading import (
     actions_towards,
     bearings_rad,
     directions,
     shortest_assignment,
 )
-from common.arena.obstacles import reachable_px
-from common.arena.scene import LEFT, Scene
-from common.config import ArenaConfig
-from common.trajectory import Float64Array, Int64Array, UInt8Array
+from mrcdrl.common.arena.world.obstacles import reachable_px
+from mrcdrl.common.arena.world.scene import LEFT, Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import Float64Array, Int64Array, UInt8Array
 
 _HORIZON_FRAMES = 30.0  # tau: collisions sooner than this are avoided
 _SLOW = 0.5  # share of the speed below which a velocity is answered by a circle

@@ -6,11 +6,15 @@ first scene is kept.
 
 import numpy as np
 
-from common.arena.controllers.heading import actions_towards, bearings_rad, shortest_assignment
-from common.arena.obstacles import reachable_px, ways_from
-from common.arena.scene import Scene
-from common.config import ArenaConfig
-from common.trajectory import Float64Array, Int64Array, UInt8Array
+from mrcdrl.common.arena.controllers.heading import (
+    actions_towards,
+    bearings_rad,
+    shortest_assignment,
+)
+from mrcdrl.common.arena.world.obstacles import reachable_px, ways_from
+from mrcdrl.common.arena.world.scene import Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import Float64Array, Int64Array, UInt8Array
 
 _ROBOTS_FROM_PX = 60.0  # gap between two robots below which they repel each other
 _WALLS_FROM_PX = 15.0  # gap between a robot and a wall below which it is repelled

@@ -14,17 +14,17 @@ import math
 
 import numpy as np
 
-from common.arena.controllers.heading import (
+from mrcdrl.common.arena.controllers.heading import (
     bearings_rad,
     directions,
     left_over_rad,
     shortest_assignment,
 )
-from common.arena.obstacles import reachable_px
-from common.arena.rewards import target_distances_px
-from common.arena.scene import LEFT, RIGHT, STRAIGHT, Scene
-from common.config import ArenaConfig
-from common.trajectory import NUM_ACTIONS, Float64Array, Int64Array, UInt8Array
+from mrcdrl.common.arena.world.obstacles import reachable_px
+from mrcdrl.common.arena.world.rewards import target_distances_px
+from mrcdrl.common.arena.world.scene import LEFT, RIGHT, STRAIGHT, Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float64Array, Int64Array, UInt8Array
 
 _MARGIN_PX = 5.0  # kept free besides: about what one random action moves a circle by
 _BETTER = 0.9  # another assignment must cost less than this share of the one in use

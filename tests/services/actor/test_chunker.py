@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.trajectory import Chunk, Float32Array, UInt8Array
-from services.actor.chunker import Chunker, Origin
+from mrcdrl.common.messages.trajectory import Chunk, Float32Array, UInt8Array
+from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
 
 STACK = 4
 
@@ -43,7 +43,7 @@ def run(
     values: of the action and of the best one in each state that was acted in; chunks bear
     priorities if they are given.
     """
-    origin = Origin("a", 9, gamma, n_step, stack, chunk_length, bool(values), reward_scale)
+    origin = ChunkerConfig("a", 9, gamma, n_step, stack, chunk_length, bool(values), reward_scale)
     chunker, sequence = Chunker(origin), iter(range(1000))
     steps = itertools.count()
     chunks: list[Chunk] = []

@@ -1,4 +1,4 @@
-"""What the policy sees is what replay gets, told from pictures that count."""
+"""What the policy sees is what replay gets, told from images that count."""
 
 from dataclasses import dataclass, field
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from common.arena import (
+from mrcdrl.common.arena import (
     CountingBatch,
     counting_frames,
     counting_outcome,
@@ -14,12 +14,20 @@ from common.arena import (
     decode_counters,
     make_codec,
 )
-from common.config import Config
-from common.network import QNetwork, weights_to_bytes
-from common.policy import Policy, Selection
-from common.trajectory import Chunk, EpisodeSummary, Float32Array, Outcome, UInt8Array, Weights
-from services.actor.chunker import Origin
-from services.actor.collector import Collector
+from mrcdrl.common.config import Config
+from mrcdrl.common.messages.trajectory import (
+    Chunk,
+    EpisodeSummary,
+    Float32Array,
+    Outcome,
+    UInt8Array,
+    Weights,
+)
+from mrcdrl.common.model.policy import Policy, Selection
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.services.actor.chunker import ChunkerConfig
+from mrcdrl.services.actor.collector import Collector
 
 VIEW_PX, ROBOTS, ARENAS, STACK, N_STEP = 32, 2, 3, 4, 3
 STEPS = 60
@@ -79,7 +87,7 @@ def make_network() -> QNetwork:
 
 def collect(steps: int, *, prioritized: bool = False) -> Collected:
     policy = WatchedPolicy(Policy(make_network()))
-    origin = Origin("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
+    origin = ChunkerConfig("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
     arenas = CountingBatch(CONFIG.arena, range(ARENAS))
     collector = Collector(
         CONFIG,
@@ -116,7 +124,7 @@ def collected() -> Collected:
     return collect(STEPS)
 
 
-def test_the_policy_sees_the_last_pictures_of_each_robot(collected: Collected) -> None:
+def test_the_policy_sees_the_last_images_of_each_robot(collected: Collected) -> None:
     for observations in collected.policy.seen:
         assert observations.shape == (ARENAS * ROBOTS, STACK, VIEW_PX, VIEW_PX)
         counters = decode_counters(observations)
@@ -128,7 +136,7 @@ def test_the_policy_sees_the_last_pictures_of_each_robot(collected: Collected) -
         assert counters.robot[:, 0].tolist() == [0, 1] * ARENAS
 
 
-def test_the_records_are_the_pictures_the_policy_acted_on(collected: Collected) -> None:
+def test_the_records_are_the_images_the_policy_acted_on(collected: Collected) -> None:
     shown: dict[tuple[int, ...], tuple[UInt8Array, int]] = {}
     for observations, selection in zip(
         collected.policy.seen, collected.policy.selections, strict=True
@@ -142,8 +150,8 @@ def test_the_records_are_the_pictures_the_policy_acted_on(collected: Collected) 
             shown[name] = (observations[state], action)
     transitions = 0
     for chunk in collected.chunks:
-        pictures = chunk.records.reshape(-1, VIEW_PX, VIEW_PX)
-        counters = decode_counters(pictures)
+        images = chunk.records.reshape(-1, VIEW_PX, VIEW_PX)
+        counters = decode_counters(images)
         for t in range(len(chunk)):
             newest = t + STACK - 1
             name = tuple(
@@ -151,7 +159,7 @@ def test_the_records_are_the_pictures_the_policy_acted_on(collected: Collected) 
                 for numbers in (counters.identity, counters.robot, counters.episode, counters.step)
             )
             stack, action = shown.pop(name)
-            np.testing.assert_array_equal(pictures[t : t + STACK], stack)
+            np.testing.assert_array_equal(images[t : t + STACK], stack)
             assert chunk.actions[t] == action
             transitions += 1
     assert transitions > ROBOTS * ARENAS * (STEPS - 12)
@@ -236,15 +244,15 @@ def test_priorities_are_the_td_errors_of_the_values_acted_by(collected: Collecte
     prioritized = collect(STEPS, prioritized=True).chunks
     assert sum(map(len, prioritized)) > ROBOTS * ARENAS * (STEPS - 12)
     for chunk in prioritized:
-        pictures = chunk.records.reshape(-1, VIEW_PX, VIEW_PX)
-        counters = decode_counters(pictures)
+        images = chunk.records.reshape(-1, VIEW_PX, VIEW_PX)
+        counters = decode_counters(images)
         frames = counting_frames(int(counters.identity[0]), int(counters.episode[0]))
         for t, offset in enumerate(chunk.bootstrap_offsets.tolist()):
-            now = network.q_values(pictures[np.newaxis, t : t + STACK])[0]
+            now = network.q_values(images[np.newaxis, t : t + STACK])[0]
             # nobody acted in an episode's last state: the one before stands for it
             step = int(counters.step[t + STACK - 1])
             ahead = min(offset, frames - 1 - step)
-            later = network.q_values(pictures[np.newaxis, t + ahead : t + ahead + STACK])[0]
+            later = network.q_values(images[np.newaxis, t + ahead : t + ahead + STACK])[0]
             target = 0.1 * chunk.rewards[t] + chunk.discounts[t] * later.max()
             error = abs(target - now[chunk.actions[t]])
             assert chunk.priorities[t] == pytest.approx(error, rel=1e-4, abs=1e-5)

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from common.config import TransportConfig
-from common.keys import Keys
-from common.trajectory import NO_SLOT, LeaseRequest
-from common.transport import Session, free_endpoint
-from common.wire import decode, encode
-from services.actor.lease import WHOLE_LADDER, LeaseKeeper
-from services.replay.leases import LeaseTable
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseRequest
+from mrcdrl.common.messages.wire import decode, encode
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.actor.lease import WHOLE_LADDER, LeaseKeeper
+from mrcdrl.services.replay.leases import LeaseTable
 from tests.system.system_processes import REPOSITORY, Command, end_all, eventually, run_name
 
 RENEWED_S = 1.0  # as if leases were so short
@@ -263,6 +263,6 @@ def test_no_two_processes_hold_a_slot_whatever_happens_to_them(tmp_path: Path) -
         for holder in holders:
             holder.end()
         end_all(run)
-    spans = sorted((s[2], s[0], s[1]) for holder in holders for s in holder.held())
+    spans = sorted((s[2], s[0], s[1]) for holder in holders for s in holder.throttled())
     for (slot, _, ended), (next_slot, began, _) in pairwise(spans):
         assert slot != next_slot or ended < began, f"two held slot {slot} at once"

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from common.errors import RefusedError
-from common.process import StopSignal
-from common.trajectory import Chunk, InsertReply
-from services.actor.sender import Sender
+from mrcdrl.common.errors import RefusedError
+from mrcdrl.common.messages.trajectory import Chunk, InsertReply
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.services.actor.sender import Sender
 
 _DEADLINE_S = 20.0
 

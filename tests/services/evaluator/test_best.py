@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.config import load_config
-from common.errors import CheckpointError
-from common.files import read_weights
-from common.network import SENT_AS, QNetwork, network_from_bytes, weights_to_bytes
-from common.policy import Policy, make_policy
-from common.trajectory import Evaluation, Weights
-from services.evaluator.__main__ import Best
+from mrcdrl.common.config import load_config
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.trajectory import Evaluation, Weights
+from mrcdrl.common.model.policy import Policy, make_policy
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_files import read_weights
+from mrcdrl.common.model.weights_io import SENT_AS, network_from_bytes, weights_to_bytes
+from mrcdrl.services.evaluator.evaluator import Best
 
 
 @pytest.fixture

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.arena import STRAIGHT, Scene, Start, layout_for, starts
-from common.arena.controllers import controller
-from common.config import ArenaConfig
-from common.trajectory import Float64Array, Outcome, UInt8Array
-from services.evaluator.navigation import Journey, journey, navigation, navigation_table
-from services.evaluator.trial import ControllerPlayer, play
+from mrcdrl.common.arena import STRAIGHT, Scene, Start, layout_for
+from mrcdrl.common.arena.controllers import controller
+from mrcdrl.common.arena.world import starts
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
+from mrcdrl.services.evaluator.navigation import Journey, journey, navigation, navigation_table
+from mrcdrl.services.evaluator.trial import ControllerPlayer, play
 
 SUCCESS, COLLISION, TIMEOUT = Outcome.SUCCESS, Outcome.COLLISION, Outcome.TIMEOUT
 TARGETS = np.array([[100.0, 100.0], [300.0, 100.0]])

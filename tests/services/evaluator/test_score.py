@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.trajectory import Evaluation, Outcome, Weights
-from services.evaluator.navigation import Journey
-from services.evaluator.score import evaluation, successes_per_100, wilson_interval
-from services.evaluator.trial import EpisodeResult
+from mrcdrl.common.messages.trajectory import Evaluation, Outcome, Weights
+from mrcdrl.services.evaluator.navigation import Journey
+from mrcdrl.services.evaluator.score import evaluation, successes_per_100, wilson_interval
+from mrcdrl.services.evaluator.trial import EpisodeResult
 
 JOURNEY = Journey(np.ones(2), np.ones(2), np.ones(2), np.zeros(2, np.bool_), np.zeros(2, np.bool_))
 SUCCESS, COLLISION, TIMEOUT = Outcome.SUCCESS, Outcome.COLLISION, Outcome.TIMEOUT

@@ -7,21 +7,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from common.arena import (
-    LEFT,
-    STRAIGHT,
-    Scene,
-    Start,
-    layout_for,
-    make_codec,
-    test_starts,
-)
-from common.arena.controllers import controller
-from common.config import ArenaConfig
-from common.network import QNetwork
-from common.policy import Policy
-from common.trajectory import Outcome, TimeStep, UInt8Array
-from services.evaluator.trial import ControllerPlayer, EpisodeResult, PolicyPlayer, play
+from mrcdrl.common.arena import LEFT, STRAIGHT, Scene, Start, layout_for, make_codec, test_starts
+from mrcdrl.common.arena.controllers import controller
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import Outcome, TimeStep, UInt8Array
+from mrcdrl.common.model.policy import Policy
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.services.evaluator.trial import ControllerPlayer, EpisodeResult, PolicyPlayer, play
 
 CONFIG = ArenaConfig(num_robots=2, view_px=32, max_frames=150)
 starts_of = test_starts  # else pytest takes it for a test

@@ -1,4 +1,4 @@
-"""Collating finds the right pictures for s and s', and turns pictures and actions together."""
+"""Collating finds the right images for s and s', and symmetry_rows images and actions together."""
 
 import dataclasses
 
@@ -8,21 +8,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import ReplayConfig
-from common.errors import WireError
-from common.trajectory import Samples, UInt8Array
-from services.learner.batch import collate, importance_exponent_at, importance_weights
-from services.learner.drawing import HostDrawing
+from mrcdrl.common.config import ReplayConfig
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.trajectory import Samples, UInt8Array
+from mrcdrl.services.learner.batch import collate, importance_exponent_at, importance_weights
+from mrcdrl.services.learner.rendering import HostRenderer
 
 VIEW_PX = 5
 
 
 def decode(records: UInt8Array) -> UInt8Array:
-    """A record is one byte: the number that fills its picture, corner marked."""
-    pictures = np.repeat(records, VIEW_PX * VIEW_PX, axis=-1)
-    pictures = pictures.reshape(*records.shape[:-1], VIEW_PX, VIEW_PX).copy()
-    pictures[..., 0, 0] = 255
-    return pictures
+    """A record is one byte: the number that fills its image, corner marked."""
+    images = np.repeat(records, VIEW_PX * VIEW_PX, axis=-1)
+    images = images.reshape(*records.shape[:-1], VIEW_PX, VIEW_PX).copy()
+    images[..., 0, 0] = 255
+    return images
 
 
 def make_samples(
@@ -47,9 +47,9 @@ def make_samples(
 
 
 def test_states_are_the_windows_the_offsets_name() -> None:
-    """Row b holds pictures 16 b, 16 b + 1, …: the numbers are the positions."""
+    """Row b holds images 16 b, 16 b + 1, …: the numbers are the positions."""
     samples = make_samples([1, 3, 2], width=7)
-    batch = collate(samples, HostDrawing(decode), 4)
+    batch = collate(samples, HostRenderer(decode), 4)
     assert batch.observation[:, :, 1, 1].tolist() == [
         [0, 1, 2, 3],
         [16, 17, 18, 19],
@@ -68,7 +68,7 @@ def test_states_are_the_windows_the_offsets_name() -> None:
 
 
 def test_dtypes_and_shapes() -> None:
-    batch = collate(make_samples([2] * 6, width=6), HostDrawing(decode), 4)
+    batch = collate(make_samples([2] * 6, width=6), HostRenderer(decode), 4)
     assert batch.observation.dtype == batch.next_observation.dtype == torch.uint8
     assert batch.observation.shape == batch.next_observation.shape == (6, 4, VIEW_PX, VIEW_PX)
     assert batch.action.dtype == torch.int64
@@ -80,7 +80,7 @@ def test_dtypes_and_shapes() -> None:
 @given(st.integers(1, 4), st.lists(st.integers(1, 5), min_size=1, max_size=8))
 @settings(deadline=None)
 def test_states_for_any_stack_and_offsets(stack: int, offsets: list[int]) -> None:
-    batch = collate(make_samples(offsets, width=stack + 5), HostDrawing(decode), stack)
+    batch = collate(make_samples(offsets, width=stack + 5), HostRenderer(decode), stack)
     for row, offset in enumerate(offsets):
         first = row * 16
         assert batch.observation[row, :, 1, 1].tolist() == list(range(first, first + stack))
@@ -96,17 +96,17 @@ def test_records_off_the_wire_are_read_only_and_decoded_once() -> None:
 
     def counting(records: UInt8Array) -> UInt8Array:
         shapes.append(records.shape)
-        pictures = decode(records)
-        pictures.flags.writeable = False
-        return pictures
+        images = decode(records)
+        images.flags.writeable = False
+        return images
 
-    collate(samples, HostDrawing(counting), 4)
+    collate(samples, HostRenderer(counting), 4)
     assert shapes == [(2, 5, 1)]
 
 
 class Identity:
-    def apply_to_pictures(self, pictures: UInt8Array) -> UInt8Array:
-        return pictures
+    def apply_to_images(self, images: UInt8Array) -> UInt8Array:
+        return images
 
     def apply_to_actions(self, actions: UInt8Array) -> UInt8Array:
         return actions
@@ -115,8 +115,8 @@ class Identity:
 class MirrorX:
     """Left-right: action 0 (left) and 2 (right) change places."""
 
-    def apply_to_pictures(self, pictures: UInt8Array) -> UInt8Array:
-        return pictures[..., ::-1]
+    def apply_to_images(self, images: UInt8Array) -> UInt8Array:
+        return images[..., ::-1]
 
     def apply_to_actions(self, actions: UInt8Array) -> UInt8Array:
         return 2 - actions
@@ -125,8 +125,8 @@ class MirrorX:
 class TurnHalf:
     """By 180 degrees: actions stay."""
 
-    def apply_to_pictures(self, pictures: UInt8Array) -> UInt8Array:
-        return pictures[..., ::-1, ::-1]
+    def apply_to_images(self, images: UInt8Array) -> UInt8Array:
+        return images[..., ::-1, ::-1]
 
     def apply_to_actions(self, actions: UInt8Array) -> UInt8Array:
         return actions
@@ -137,16 +137,16 @@ def test_a_transition_and_its_action_undergo_the_same_symmetry() -> None:
     samples = make_samples([1, 2, 3] * 10, width=7)
     symmetries = (Identity(), MirrorX(), TurnHalf())
     rng = np.random.default_rng(0)
-    batch = collate(samples, HostDrawing(decode), 4, symmetries=symmetries, rng=rng)
+    batch = collate(samples, HostRenderer(decode), 4, symmetries=symmetries, rng=rng)
     corners = {(0, 0): 0, (0, VIEW_PX - 1): 1, (VIEW_PX - 1, VIEW_PX - 1): 2}
     seen = set()
-    plain = collate(samples, HostDrawing(decode), 4)
+    plain = collate(samples, HostRenderer(decode), 4)
     for row in range(30):
         both = torch.cat([batch.observation[row], batch.next_observation[row]])
         y, x = np.unravel_index(int(both[0].argmax()), (VIEW_PX, VIEW_PX))
         drawn = corners[int(y), int(x)]
         seen.add(drawn)
-        assert (both[:, y, x] == 255).all(), "every picture of the transition alike"
+        assert (both[:, y, x] == 255).all(), "every image of the transition alike"
         expected = samples.actions[row] if drawn != 1 else 2 - samples.actions[row]
         assert batch.action[row] == expected
         assert batch.observation[row, :, 1, 1].tolist() == plain.observation[row, :, 1, 1].tolist()
@@ -155,7 +155,7 @@ def test_a_transition_and_its_action_undergo_the_same_symmetry() -> None:
 
 def test_symmetries_need_a_generator() -> None:
     with pytest.raises(ValueError, match="rng"):
-        collate(make_samples([1], width=5), HostDrawing(decode), 4, symmetries=(Identity(),))
+        collate(make_samples([1], width=5), HostRenderer(decode), 4, symmetries=(Identity(),))
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_symmetries_need_a_generator() -> None:
 )
 def test_samples_that_cannot_be_are_refused(samples: Samples, message: str) -> None:
     with pytest.raises(WireError, match=message):
-        collate(samples, HostDrawing(decode), 4)
+        collate(samples, HostRenderer(decode), 4)
 
 
 def test_importance_weights_by_hand() -> None:
@@ -198,7 +198,7 @@ def test_of_equal_probabilities_all_weights_are_exactly_1() -> None:
 
 def test_a_batch_keeps_nothing_of_the_samples_memory() -> None:
     sampled = make_samples([1, 3, 2], width=7)
-    batch = collate(sampled, HostDrawing(decode), 4)
+    batch = collate(sampled, HostRenderer(decode), 4)
     parts = (batch.observation, batch.action, batch.reward, batch.discount, batch.next_observation)
     for array in (*(part.numpy() for part in parts), batch.keys):
         for field in dataclasses.fields(sampled):

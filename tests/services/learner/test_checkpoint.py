@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import CheckpointError
-from common.files import atomic_write, read_weights, write_weights
-from services.learner.checkpoint import Checkpoint, latest, load, load_latest, save
-from services.learner.learner import LearnerState
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.model.weights_files import read_weights, write_weights
+from mrcdrl.common.runtime.files import atomic_write
+from mrcdrl.services.learner.checkpoint import Checkpoint, latest, load, load_latest, save
+from mrcdrl.services.learner.learner import LearnerState
 
 
 def make_checkpoint(step: int = 5, *, epoch: int = 1, version: int | None = None) -> Checkpoint:

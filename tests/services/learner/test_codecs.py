@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from common.arena import make_codec
-from common.config import Config, load_config
-from common.policy import make_policy
-from common.trajectory import Chunk, Weights
-from services.actor.__main__ import make_collector
-from services.learner.__main__ import make_collate
-from services.learner.learner import Learner
-from services.replay.__main__ import build
+from mrcdrl.common.arena import make_codec
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.messages.trajectory import Chunk, Weights
+from mrcdrl.common.model.policy import make_policy
+from mrcdrl.services.actor.actor import make_collector
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.learner.main import make_collate
+from mrcdrl.services.replay.build import build
 
 NUM_STEPS = 5
 

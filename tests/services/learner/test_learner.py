@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from common.config import AgentConfig, LearnerConfig
-from common.errors import CheckpointError, ConfigError, DivergedError
-from common.trajectory import Float32Array
-from services.learner.batch import Batch
-from services.learner.learner import Learner
+from mrcdrl.common.config import AgentConfig, LearnerConfig
+from mrcdrl.common.errors import CheckpointError, ConfigError, DivergedError
+from mrcdrl.common.messages.trajectory import Float32Array
+from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.learner.learner import Learner
 
 VIEW_PX = 31
 FLOAT32 = LearnerConfig(precision="float32", device="cpu")
@@ -36,13 +36,13 @@ def make_learner(
 def random_batch(size: int = 8, seed: int = 0) -> Batch:
     generator = torch.Generator().manual_seed(seed)
     shape = (2, size, 4, VIEW_PX, VIEW_PX)
-    pictures = torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
+    images = torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
     return Batch(
-        observation=pictures[0],
+        observation=images[0],
         action=torch.randint(0, 3, (size,), generator=generator),
         reward=torch.randn(size, generator=generator),
         discount=torch.full((size,), 0.99),
-        next_observation=pictures[1],
+        next_observation=images[1],
         importance_weights=torch.ones(size),
         keys=np.arange(size),
     )
@@ -72,19 +72,19 @@ GAMMA = 0.7
 
 def walk() -> tuple[Batch, Float32Array]:
     """All transitions out of places 0 to 3, and the optimal values [4, 3]."""
-    pictures = torch.zeros((PLACES, 1, VIEW_PX, VIEW_PX), dtype=torch.uint8)
+    images = torch.zeros((PLACES, 1, VIEW_PX, VIEW_PX), dtype=torch.uint8)
     for place in range(PLACES):
-        pictures[place, :, :, place * 6 : place * 6 + 6] = 255
+        images[place, :, :, place * 6 : place * 6 + 6] = 255
     places = torch.arange(PLACES - 1).repeat_interleave(3)
     actions = torch.arange(3).repeat(PLACES - 1)
     following = (places + actions - 1).clamp(0, PLACES - 1)
     ends = following == PLACES - 1
     batch = Batch(
-        observation=pictures[places],
+        observation=images[places],
         action=actions,
         reward=ends.float(),
         discount=torch.where(ends, 0.0, GAMMA),
-        next_observation=pictures[following],
+        next_observation=images[following],
         importance_weights=torch.ones(len(places)),
         keys=np.arange(len(places)),
     )

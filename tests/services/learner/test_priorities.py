@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from common.errors import RefusedError
-from common.trajectory import Priorities, PrioritiesReply
-from services.learner import priorities
-from services.learner.priorities import PrioritiesSender
+from mrcdrl.common.errors import RefusedError
+from mrcdrl.common.messages.trajectory import Priorities, PrioritiesReply
+from mrcdrl.services.learner import priorities
+from mrcdrl.services.learner.priorities import PrioritiesSender
 
 _DEADLINE_S = 20.0
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from common.config import Config, load_config
-from common.policy import make_policy
-from services.actor.__main__ import make_collector
-from services.actor.collector import Collector
-from services.learner.__main__ import make_collate
-from services.learner.keeper import Keeper
-from services.learner.learner import Learner, LearnerState
-from services.replay.service import ReplayService
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.model.policy import make_policy
+from mrcdrl.services.actor.actor import make_collector
+from mrcdrl.services.actor.collector import Collector
+from mrcdrl.services.learner.learner import Learner, LearnerState
+from mrcdrl.services.learner.main import make_collate
+from mrcdrl.services.learner.weights_publisher import Keeper
+from mrcdrl.services.replay.service import ReplayService
 from tests.services.replay.test_snapshot import insert, save, start
 
 BROKEN_OFF, STEPS = 12, 25  # learner steps

@@ -2,9 +2,9 @@
 
 import pytest
 
-from common.config import Config, load_config
-from common.errors import ConfigError
-from services.replay.__main__ import build
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.errors import ConfigError
+from mrcdrl.services.replay.build import build
 
 
 def config_of(**replay: object) -> Config:

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from common.errors import HeldError
-from common.keys import Keys
-from common.process import StopSignal
-from common.trajectory import Chunk, InsertReply
-from common.wire import encode
-from services.replay import client
-from services.replay.client import ReplayWriter
+from mrcdrl.common.errors import ThrottledError
+from mrcdrl.common.messages.trajectory import Chunk, InsertReply
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay import client
+from mrcdrl.services.replay.client import ReplayWriter
 
 
 class FakeReplay:
@@ -30,7 +30,7 @@ class FakeReplay:
     def result(self) -> bytes:
         self.holds -= 1
         if self.holds >= 0:
-            raise HeldError("256 requests are waiting")
+            raise ThrottledError("256 requests are waiting")
         return encode(InsertReply(0, False, 3))
 
     def release(self) -> None:
@@ -60,7 +60,7 @@ def insert(holds: int, stop: StopSignal) -> ReplayWriter:
 def test_who_is_sent_away_at_once_asks_less_and_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client.time, "monotonic", lambda: 100.0)
     stop = Waits()
-    assert insert(7, stop).held == 7
+    assert insert(7, stop).throttled == 7
     assert stop.seconds == pytest.approx([0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2])
 
 
@@ -68,5 +68,5 @@ def test_who_was_let_wait_asks_again_at_once(monkeypatch: pytest.MonkeyPatch) ->
     seconds = iter(range(0, 1000, 5))
     monkeypatch.setattr(client.time, "monotonic", lambda: float(next(seconds)))
     stop = Waits()
-    assert insert(3, stop).held == 3
+    assert insert(3, stop).throttled == 3
     assert stop.seconds == []

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.config import Config, to_toml
-from common.errors import ConfigError, RunDirectoryError
-from common.trajectory import Chunk
-from common.wire import encode
-from services import cli
-from services.replay.inspect import main
-from services.replay.log import SegmentLog
+from mrcdrl import cli
+from mrcdrl.common.config import Config, to_toml
+from mrcdrl.common.errors import ConfigError, RunDirectoryError
+from mrcdrl.common.messages.trajectory import Chunk
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.services.replay.inspect.main import main
+from mrcdrl.services.replay.log import SegmentLog
 from tests.services.replay.test_snapshot import (
     CONFIG,
     LENGTH,

@@ -7,9 +7,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from common.trajectory import NO_SLOT, LeaseReply, LeaseRequest
-from services.actor.lease import WHOLE_LADDER, HeldLease
-from services.replay.leases import LeaseTable
+from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseReply, LeaseRequest
+from mrcdrl.services.actor.lease import WHOLE_LADDER, HeldLease
+from mrcdrl.services.replay.leases import LeaseTable
 
 LEASE_S = 10.0
 ANSWER_S = 2.0

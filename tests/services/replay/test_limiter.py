@@ -5,8 +5,8 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from common.errors import ConfigError
-from services.replay.limiter import RateLimiter
+from mrcdrl.common.errors import ConfigError
+from mrcdrl.services.replay.limiter import RateLimiter
 
 
 class TwoSides(RuleBasedStateMachine):

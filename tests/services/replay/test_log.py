@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import RunDirectoryError
-from services.replay.log import SegmentLog
+from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.services.replay.log import SegmentLog
 
 
 def open_log(directory: Path, segment_bytes: int = 100) -> SegmentLog:

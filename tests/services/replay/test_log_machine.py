@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from services.replay.log import SegmentLog, read_segment, segment_paths
+from mrcdrl.services.replay.log import SegmentLog, read_segment, segment_paths
 
 PER_PAYLOAD = 10  # transitions that each payload stands for
 

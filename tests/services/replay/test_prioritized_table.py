@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.trajectory import Float64Array, Samples
-from common.wire import decode, encode
-from services.learner.batch import importance_weights
-from services.replay.service import ReplayService
+from mrcdrl.common.messages.trajectory import Float64Array, Samples
+from mrcdrl.common.messages.wire import decode, encode
+from mrcdrl.services.learner.batch import importance_weights
+from mrcdrl.services.replay.service import ReplayService
 from tests.services.replay.test_snapshot import CONFIG, LENGTH, chunk, insert, save, start
 
 BATCH, BATCHES = 64, 1500

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.config import Config, load_config
-from common.framing import Part
-from common.trajectory import Chunk
-from common.wire import encode
-from services.replay.__main__ import build, open_log
-from services.replay.service import ReplayService
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.messages.framing import Part
+from mrcdrl.common.messages.trajectory import Chunk
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.services.replay.build import build, open_log
+from mrcdrl.services.replay.service import ReplayService
 
 CONFIG = load_config(
     "smoke",
@@ -51,7 +51,7 @@ class Answered:
     def refuse(self, reason: str) -> None:
         self.answers.append(f"refused: {reason}")
 
-    def hold(self, reason: str) -> None:
+    def throttle(self, reason: str) -> None:
         self.answers.append(f"held: {reason}")
 
 

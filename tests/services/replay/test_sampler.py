@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from common.trajectory import Float32Array, Float64Array, Int64Array, Samples
-from services.learner.batch import importance_weights
-from services.replay.sampler import PrioritizedSampler
+from mrcdrl.common.messages.trajectory import Float32Array, Float64Array, Int64Array, Samples
+from mrcdrl.services.learner.batch import importance_weights
+from mrcdrl.services.replay.sampler import PrioritizedSampler
 
 HELD, FIRST_KEY, EXPONENT = 200, 1_000_003, 0.6
 KEYS = range(FIRST_KEY, FIRST_KEY + HELD)

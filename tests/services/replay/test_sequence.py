@@ -5,7 +5,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from services.replay.sequence import Arrival, SequenceBook
+from mrcdrl.services.replay.sequence import Arrival, SequenceBook
 
 
 @pytest.mark.parametrize(

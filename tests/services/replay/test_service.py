@@ -12,14 +12,22 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from common.config import Config, ReplayConfig, RunConfig, TransportConfig
-from common.framing import Part, join_set
-from common.trajectory import Chunk, InsertReply, Priorities, PrioritiesReply, Samples, Stats
-from common.wire import SampleRequest, decode, encode, encode_parts
-from services.replay.limiter import RateLimiter
-from services.replay.sampler import PrioritizedSampler, UniformSampler
-from services.replay.service import ReplayService
-from services.replay.table import Table
+from mrcdrl.common.config import Config, ReplayConfig, RunConfig, TransportConfig
+from mrcdrl.common.messages.framing import Part, join_set
+from mrcdrl.common.messages.trajectory import (
+    Chunk,
+    InsertReply,
+    Priorities,
+    PrioritiesReply,
+    SampleRequest,
+    Samples,
+    Stats,
+)
+from mrcdrl.common.messages.wire import decode, encode, encode_parts
+from mrcdrl.services.replay.limiter import RateLimiter
+from mrcdrl.services.replay.sampler import PrioritizedSampler, UniformSampler
+from mrcdrl.services.replay.service import ReplayService
+from mrcdrl.services.replay.table import Table
 
 _DEADLINE_S = 20.0  # of what is to happen at once
 LENGTH, BATCH = 5, 4
@@ -43,7 +51,7 @@ class FakeRequest:
     def refuse(self, reason: str) -> None:
         self.answers.put(("refuse", reason))
 
-    def hold(self, reason: str) -> None:
+    def throttle(self, reason: str) -> None:
         self.answers.put(("hold", reason))
 
     def answer(self) -> tuple[str, bytes | str]:

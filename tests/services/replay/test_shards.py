@@ -8,14 +8,14 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from common.config import Config, TransportConfig
-from common.keys import Keys
-from common.process import StopSignal
-from common.trajectory import Chunk, Priorities, Samples
-from common.transport import Session, free_endpoint
-from services.replay.__main__ import build
-from services.replay.client import PriorityWriter, ReplayReader, ReplayWriter, shard_of
-from services.replay.service import ReplayService
+from mrcdrl.common.config import Config, TransportConfig
+from mrcdrl.common.messages.trajectory import Chunk, Priorities, Samples
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.replay.build import build
+from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter, shard_of
+from mrcdrl.services.replay.service import ReplayService
 
 _DEADLINE_S = 30.0
 KEYS = Keys("shards")

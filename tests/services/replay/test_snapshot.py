@@ -13,14 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.config import Config, load_config
-from common.errors import CheckpointError
-from common.trajectory import Chunk, Float64Array
-from common.wire import encode
-from services.replay.__main__ import build, open_log
-from services.replay.sampler import priorities_of
-from services.replay.service import ReplayService
-from services.replay.snapshot import Settings, Snapshot, SnapshotWriter, read_snapshot
+from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.trajectory import Chunk, Float64Array
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.services.replay.build import build, open_log
+from mrcdrl.services.replay.sampler import priorities_of
+from mrcdrl.services.replay.service import ReplayService
+from mrcdrl.services.replay.snapshot import Settings, Snapshot, SnapshotWriter, read_snapshot
 from tests.services.replay.test_recover import Answered, NoServer
 
 LENGTH = 16

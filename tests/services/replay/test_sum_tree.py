@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from services.replay.sum_tree import SumTree
+from mrcdrl.services.replay.sum_tree import SumTree
 
 # From what rounds to nothing beside the others to what swallows them.
 VALUES = st.one_of(st.just(0.0), st.floats(1e-12, 1e12), st.floats(0.0, 1.0, width=16))

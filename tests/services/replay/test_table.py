@@ -19,10 +19,10 @@ from hypothesis.stateful import (
     rule,
 )
 
-from common.errors import WireError
-from common.trajectory import Chunk, Float64Array, Int64Array, UInt8Array
-from services.replay.sampler import PrioritizedSampler, UniformSampler
-from services.replay.table import Table
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.trajectory import Chunk, Float64Array, Int64Array, UInt8Array
+from mrcdrl.services.replay.sampler import PrioritizedSampler, UniformSampler
+from mrcdrl.services.replay.table import Table
 
 RECORD_BYTES = 4
 EXPONENT = 0.6

@@ -2,18 +2,18 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from common.errors import DivergedError, MrcdrlError
-from services.train import fleet as fleet_module
-from services.train.fleet import Fleet
+from mrcdrl.common.errors import DivergedError, MrcdrlError
+from mrcdrl.services.train import fleet as fleet_module
+from mrcdrl.services.train.fleet import Fleet
 
 _DEADLINE_S = 60.0
 
-# `python -m services.actor` runs this when it is started beside a folder that holds it.
 _WAITS = """
 import os, signal, sys
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -34,8 +34,9 @@ def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     os.mkfifo(tmp_path / "ready")
     monkeypatch.setenv("READY", str(tmp_path / "ready"))
-    (tmp_path / "services").mkdir()
-    (tmp_path / "services" / "__init__.py").touch()
+    start = tmp_path / "start.py"
+    start.write_text("import runpy, sys; runpy.run_path(sys.argv.pop(1) + '.py')")
+    monkeypatch.setattr(fleet_module, "COMMAND", (sys.executable, str(start)))
     return tmp_path
 
 
@@ -47,8 +48,8 @@ def fleet(beside: Path) -> Iterator[Fleet]:
 
 
 def put(beside: Path, role: str, code: str) -> None:
-    """Have `services.<role>` be this code."""
-    (beside / "services" / f"{role}.py").write_text(code)
+    """Have a service of this role run this code."""
+    (beside / f"{role}.py").write_text(code)
 
 
 def ready(beside: Path) -> int:

@@ -1,0 +1,1 @@
+"""The arena behind the APIs of PettingZoo, Gymnasium and stable-baselines3."""

@@ -1,0 +1,122 @@
+"""The arena as stable-baselines3's VecEnv for one shared policy: every robot is a sub-environment.
+
+Invariants: the robots of an arena lie side by side and end together; the step that ends an episode
+returns the first states of the next one, and the last of the old one as `terminal_observation`.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from stable_baselines3.common.vec_env import VecEnv
+
+from mrcdrl.common.arena.envs.parallel_env import ArenaParallelEnv
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, UInt8Array
+
+
+class ArenaVecEnv(VecEnv):  # type: ignore[misc]
+    """Observations uint8 [N, stack, V, V]; actions [N] of 0 left, 1 straight, 2 right.
+
+    infos of a robot: those of ArenaParallelEnv; at an end also `terminal_observation` and
+    `TimeLimit.truncated`, as stable-baselines3 wants them.
+    """
+
+    def __init__(
+        self,
+        num_arenas: int = 1,
+        config: ArenaConfig | None = None,
+        *,
+        render_mode: str | None = None,
+    ) -> None:
+        """Raises ConfigError when robots or targets do not fit, ValueError for another mode."""
+        if num_arenas < 1:
+            raise ValueError(f"num_arenas {num_arenas}: at least 1")
+        self._arenas = [
+            ArenaParallelEnv(config, render_mode=render_mode) for _ in range(num_arenas)
+        ]
+        self._agents = self._arenas[0].possible_agents
+        self._actions: list[dict[str, int]] = []
+        agent = self._agents[0]
+        super().__init__(
+            num_arenas * len(self._agents),
+            self._arenas[0].observation_space(agent),
+            self._arenas[0].action_space(agent),
+        )
+
+    def reset(self) -> UInt8Array:
+        """Begins an episode everywhere; by the seeds given to `seed`, the first time after it."""
+        states: list[UInt8Array] = []
+        for number, arena in enumerate(self._arenas):
+            observations, _ = arena.reset(self._seeds[number * len(self._agents)])
+            states += observations.values()
+        self._reset_seeds()
+        return np.stack(states)
+
+    def step_async(self, actions: ArrayLike) -> None:
+        """Keeps the actions [N] for step_wait."""
+        by_arena = np.asarray(actions).reshape(len(self._arenas), len(self._agents)).tolist()
+        self._actions = [dict(zip(self._agents, own, strict=True)) for own in by_arena]
+
+    def step_wait(self) -> tuple[UInt8Array, Float32Array, BoolArray, list[dict[str, Any]]]:
+        """Plays one frame everywhere, and begins an episode where one ended."""
+        states: list[UInt8Array] = []
+        rewards: list[float] = []
+        ends: list[bool] = []
+        infos: list[dict[str, Any]] = []
+        for arena, actions in zip(self._arenas, self._actions, strict=True):
+            observations, paid, terminated, truncated, told = arena.step(actions)
+            rewards += paid.values()
+            infos += told.values()
+            ended = not arena.agents
+            if ended:
+                for agent, last in observations.items():
+                    told[agent]["terminal_observation"] = last
+                    told[agent]["TimeLimit.truncated"] = truncated[agent] and not terminated[agent]
+                observations, _ = arena.reset()
+            states += observations.values()
+            ends += [ended] * len(self._agents)
+        return np.stack(states), np.array(rewards, np.float32), np.array(ends), infos
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def get_images(self) -> Sequence[UInt8Array | None]:
+        """Each robot's arena as RGB [600, 600, 3]; None in other modes than rgb_array."""
+        images = [arena.render() for arena in self._arenas]
+        return [image for image in images for _ in self._agents]
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """An attribute of each robot's arena."""
+        return [getattr(arena, attr_name) for arena in self._of(indices)]
+
+    def set_attr(
+        self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None
+    ) -> None:
+        """Sets an attribute of each robot's arena."""
+        for arena in self._of(indices):
+            setattr(arena, attr_name, value)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: int | Iterable[int] | None = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Calls a method of each robot's arena."""
+        return [
+            getattr(arena, method_name)(*method_args, **method_kwargs)
+            for arena in self._of(indices)
+        ]
+
+    def env_is_wrapped(
+        self, wrapper_class: type, indices: int | Iterable[int] | None = None
+    ) -> list[bool]:
+        """No robot's arena is."""
+        return [isinstance(arena, wrapper_class) for arena in self._of(indices)]
+
+    def _of(self, indices: int | Iterable[int] | None) -> list[ArenaParallelEnv]:
+        """The arenas of these robots, of all if None."""
+        return [self._arenas[robot // len(self._agents)] for robot in self._get_indices(indices)]

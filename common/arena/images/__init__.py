@@ -1,0 +1,1 @@
+"""What robots see: renderers, observation records, camera noise."""

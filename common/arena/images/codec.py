@@ -1,0 +1,134 @@
+"""What an observation record holds, and how its image is got back.
+
+Invariants: both codecs give the same pixels for the same scene, because both draw from the scene
+rounded to float32; a record is a fixed number of bytes.
+"""
+
+from itertools import accumulate
+from typing import Protocol
+
+import numpy as np
+
+from mrcdrl.common.arena.images.noise import NoiseSeeds, add_noise
+from mrcdrl.common.arena.images.rendering import literal_views
+from mrcdrl.common.arena.images.views import AnalyticViews
+from mrcdrl.common.arena.world.scene import Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array
+
+_NUMBER = np.dtype("<f4")
+_SEED = np.dtype("<u4")
+
+
+class ObservationCodec(Protocol):
+    """Lockstep a scene into one record a robot, and records into images."""
+
+    record_bytes: int
+
+    def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
+        """Records [..., K, R] of the robots' views, of one scene or a stack of them.
+
+        noise_seeds: [..., K], where the images are noisy; 0 if None.
+        """
+        ...
+
+    def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
+        """Images [..., V, V] of records [..., R], in out (C-contiguous) if given."""
+        ...
+
+
+class SceneCodec:
+    """A record is the scene as its robot lists it; the image is drawn when it is needed.
+
+    float32, little-endian: own x, y, heading; x, y, heading of the other robots in their order;
+    x, y of the targets; x, y, radius of the obstacles. Then, with pixel_noise, the seed of the
+    noise as uint32.
+    """
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self._config = config
+        num = config.num_robots
+        counts = (3 * num, 2 * config.target_count, 3 * config.obstacle_count)
+        self._ends = tuple(accumulate(counts))  # of robots, targets, obstacles
+        self.record_bytes = _NUMBER.itemsize * (self._ends[-1] + bool(config.pixel_noise))
+        self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
+        self._views = AnalyticViews(config) if config.renders_analytically else None
+
+    def __repr__(self) -> str:
+        return f"SceneCodec(record_bytes={self.record_bytes})"
+
+    def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
+        num = len(self._order)
+        leading = scene.robots.shape[:-2]
+        records = np.empty((*leading, num, self.record_bytes), np.uint8)
+        numbers = records.view(_NUMBER)
+        robots, targets, obstacles = self._ends
+        poses = scene.robots[..., self._order, :]
+        numbers[..., :robots] = poses.reshape(*leading, num, robots)
+        numbers[..., robots:targets] = scene.targets.reshape(*leading, 1, targets - robots)
+        numbers[..., targets:obstacles] = scene.obstacles.reshape(*leading, 1, obstacles - targets)
+        if self._config.pixel_noise:
+            records.view(_SEED)[..., -1] = 0 if noise_seeds is None else noise_seeds
+        return records
+
+    def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
+        images = _images(records, self.record_bytes, self._config.view_px, out)
+        flat = np.require(records.reshape(-1, self.record_bytes), requirements=["C", "A", "W"])
+        scenes = flat.view(_NUMBER)
+        views = images.reshape(-1, *images.shape[-2:])
+        if self._views is not None:
+            self._views.draw(scenes, views)
+        else:
+            for view, scene in zip(views, scenes, strict=True):
+                view[:] = literal_views(self._scene_of(scene), self._config)[0]
+        if self._config.pixel_noise:
+            add_noise(views, flat.view(_SEED)[:, -1], self._config.pixel_noise)
+        return images
+
+    def _scene_of(self, numbers: Float32Array) -> Scene:
+        robots, targets, obstacles = np.split(numbers.astype(np.float64), self._ends)[:3]
+        return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2), obstacles.reshape(-1, 3))
+
+
+class FrameCodec:
+    """A record is the image's pixels, row by row."""
+
+    def __init__(self, config: ArenaConfig) -> None:
+        self._config = config
+        self._scenes = SceneCodec(config)
+        self.record_bytes = config.view_px**2
+
+    def __repr__(self) -> str:
+        return f"FrameCodec(record_bytes={self.record_bytes})"
+
+    def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
+        records = self._scenes.encode(scene, noise_seeds)
+        return self._scenes.decode(records).reshape(*records.shape[:-1], self.record_bytes)
+
+    def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
+        images = _images(records, self.record_bytes, self._config.view_px, out)
+        images[:] = records.reshape(images.shape)
+        return images
+
+
+def make_codec(config: ArenaConfig) -> ObservationCodec:
+    """The codec that config.codec names."""
+    return SceneCodec(config) if config.codec == "scene" else FrameCodec(config)
+
+
+def _images(
+    records: UInt8Array, record_bytes: int, view_px: int, out: UInt8Array | None
+) -> UInt8Array:
+    """out, or new images, for records; raises ValueError when either does not fit."""
+    if records.dtype != np.uint8 or records.shape[-1:] != (record_bytes,):
+        raise ValueError(
+            f"records are {records.dtype} {records.shape}, not uint8 [..., {record_bytes}]"
+        )
+    shape = (*records.shape[:-1], view_px, view_px)
+    if out is None:
+        return np.empty(shape, np.uint8)
+    if out.dtype != np.uint8 or out.shape != shape or not out.flags.carray:
+        raise ValueError(
+            f"out is {out.dtype} {out.shape}, not C-contiguous writeable uint8 {shape}"
+        )
+    return out

@@ -1,0 +1,1 @@
+"""The 2-D world: layouts, starts, physics, rewards, symmetries."""

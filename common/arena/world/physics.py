@@ -1,0 +1,223 @@
+"""Moves the robots of many arenas and finds their collisions, compiled.
+
+Each robot turns, then proposes its way of step_px. Two proposals that overlap undo each other, one
+into a wall or an obstacle is undone (the turn stays); a proposal that overlaps a robot so restored
+is undone too, until none does. All whose way was undone have collided. With back_off_frames, a
+robot that collided is driven straight backwards for that many frames, whatever its action; it may
+be blocked again meanwhile, which neither counts as its collision nor prolongs it.
+
+Invariants: after every move no two robots' centres are nearer than two radii and no robot overlaps
+a wall or an obstacle (touching is allowed); the outcome does not depend on
+the robots' order. Numbers are computed as pymunk does, so that both give the same bits
+(common.arena.pymunk_physics).
+"""
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+from mrcdrl.common.arena.world.obstacles import inner_walls, outer_walls, reachable_px
+from mrcdrl.common.arena.world.scene import STRAIGHT
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, Int64Array, UInt8Array
+
+
+class Physics(Protocol):
+    """The robots of A arenas, none of which is placed at first."""
+
+    @property
+    def robots(self) -> Float64Array:
+        """Poses [A, K, 3]; to be read only."""
+        ...
+
+    def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
+        """Puts an arena's robots at the poses [K, 3] and forgets their collisions.
+
+        obstacles: discs [O, 3] that stay. Raises ValueError when a robot overlaps anything.
+        """
+        ...
+
+    def move(
+        self, arenas: Int64Array, actions: UInt8Array, failed: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Lockstep and moves every robot of the arenas [N] at once; actions: [N, K].
+
+        failed: robots [N, K] that stand and are in the others' way. Returns who collided [N, K]
+        and, of those, whose way led into a wall or obstacle [N, K].
+        """
+        ...
+
+
+class ArrayPhysics:
+    """The rule as one compiled loop over arrays."""
+
+    def __init__(self, config: ArenaConfig, num_arenas: int) -> None:
+        self._config = config
+        self._walls = np.concatenate([outer_walls(config), inner_walls(config)])
+        self._obstacles = np.zeros((num_arenas, config.obstacle_count, 3))
+        self._robots = np.zeros((num_arenas, config.num_robots, 3))
+        self._back_off = np.zeros((num_arenas, config.num_robots), np.int64)
+
+    @property
+    def robots(self) -> Float64Array:
+        return self._robots
+
+    def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
+        check_placed(self._config, robots, obstacles)
+        self._robots[arena] = robots
+        self._obstacles[arena] = obstacles
+        self._back_off[arena] = 0
+
+    def move(
+        self, arenas: Int64Array, actions: UInt8Array, failed: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
+        collided = np.empty(actions.shape, np.bool_)
+        hit_wall = np.empty(actions.shape, np.bool_)
+        config = self._config
+        _move_all(
+            arenas,
+            actions,
+            failed,
+            self._robots,
+            self._back_off,
+            self._walls,
+            self._obstacles,
+            math.radians(config.turn_deg),
+            config.step_px,
+            config.robot_radius_px,
+            config.back_off_frames,
+            collided,
+            hit_wall,
+        )
+        return collided, hit_wall
+
+
+def check_placed(config: ArenaConfig, robots: Float64Array, obstacles: Float64Array) -> None:
+    """Raises ValueError when a robot at the poses [K, 3] overlaps anything."""
+    bounds, radius = reachable_px(config), config.robot_radius_px
+    i, problem = _first_misplaced(robots, bounds, radius, inner_walls(config), obstacles)
+    if problem:
+        what = ("is not between the walls", "overlaps an obstacle or wall", "overlaps another")
+        raise ValueError(f"robot {i} at {tuple(robots[i].tolist())} {what[problem - 1]}")
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _first_misplaced(robots, bounds, radius, walls, obstacles):  # type: ignore[no-untyped-def]
+    """The first robot that cannot be where it is, and why: 1 bounds, 2 what stays, 3 a robot."""
+    low, high = bounds
+    for i in range(len(robots)):
+        x, y, heading = robots[i]
+        if not (low <= x <= high and low <= y <= high and math.isfinite(heading)):
+            return i, 1
+        if _meets_fixed(x, y, radius, walls, obstacles):
+            return i, 2
+        if _meets_robot(i, robots, radius):
+            return i, 3
+    return 0, 0
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _move_all(  # type: ignore[no-untyped-def]
+    arenas,
+    actions,
+    failed,
+    robots,
+    back_off,
+    walls,
+    obstacles,
+    turn_rad,
+    step_px,
+    radius,
+    back_off_frames,
+    collided,
+    hit_wall,
+):
+    num_robots = robots.shape[1]
+    places = np.empty((num_robots, 2), np.float64)
+    hits = np.empty(num_robots, np.bool_)
+    for n in range(len(arenas)):
+        poses, backs = robots[arenas[n]], back_off[arenas[n]]
+        blocked, beyond = collided[n], hit_wall[n]
+        for i in range(num_robots):
+            if failed[n, i]:
+                places[i, 0], places[i, 1] = poses[i, 0], poses[i, 1]
+                beyond[i] = False
+                continue
+            if backs[i] == 0 and actions[n, i] != STRAIGHT:
+                turn = (np.int64(actions[n, i]) - STRAIGHT) * turn_rad
+                poses[i, 2] = _wrapped(poses[i, 2] + turn)
+            way = -step_px if backs[i] > 0 else step_px
+            places[i, 0] = poses[i, 0] + way * math.cos(poses[i, 2])
+            places[i, 1] = poses[i, 1] + way * math.sin(poses[i, 2])
+            beyond[i] = _meets_fixed(
+                places[i, 0], places[i, 1], radius, walls, obstacles[arenas[n]]
+            )
+        blocked[:] = failed[n]
+        _block(poses, places, radius, beyond, blocked, hits)
+        for i in range(num_robots):
+            poses[i, 0], poses[i, 1] = places[i, 0], places[i, 1]
+            if failed[n, i]:
+                blocked[i] = False
+            elif backs[i] > 0:
+                backs[i] -= 1
+                blocked[i] = beyond[i] = False
+            elif blocked[i]:
+                backs[i] = back_off_frames
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _block(poses, places, radius, beyond, blocked, hits):  # type: ignore[no-untyped-def]
+    """Puts places [K, 2] that cannot be taken back to the poses', and marks them blocked.
+
+    Robots that are blocked already stand where they are.
+    """
+    again = True
+    while again:
+        again = False
+        for i in range(len(places)):
+            hits[i] = not blocked[i] and (beyond[i] or _meets_robot(i, places, radius))
+        for i in range(len(places)):
+            if hits[i]:
+                places[i, 0], places[i, 1] = poses[i, 0], poses[i, 1]
+                blocked[i] = again = True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _meets_robot(i, places, radius):  # type: ignore[no-untyped-def]
+    reach = radius + radius
+    for j in range(len(places)):
+        across = places[i, 0] - places[j, 0]
+        along = places[i, 1] - places[j, 1]
+        if j != i and across * across + along * along < reach * reach:
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _meets_fixed(x, y, radius, walls, obstacles):  # type: ignore[no-untyped-def]
+    """Whether the disc overlaps an obstacle, or a wall: its nearest point is too near."""
+    for n in range(len(obstacles)):
+        across, along = obstacles[n, 0] - x, obstacles[n, 1] - y
+        reach = radius + obstacles[n, 2]
+        if across * across + along * along < reach * reach:
+            return True
+    for ax, ay, bx, by, half in walls:
+        dx, dy = bx - ax, by - ay
+        t = (dx * (x - ax) + dy * (y - ay)) / (dx * dx + dy * dy)
+        t = max(0.0, min(t, 1.0))
+        across, along = ax + dx * t - x, ay + dy * t - y
+        reach = radius + half
+        if across * across + along * along < reach * reach:
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _wrapped(angle):  # type: ignore[no-untyped-def]
+    """math.remainder(angle, math.tau), which numba lacks; both are exact."""
+    rest = np.fmod(angle, math.tau)
+    if rest > math.pi:
+        return rest - math.tau
+    return rest + math.tau if rest < -math.pi else rest

@@ -1,0 +1,119 @@
+"""What a frame is worth to each robot (paper section 3), in many arenas at once.
+
+Invariants: pure functions of the scene after the frame; success is all robots' or none's.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from mrcdrl.common.arena.world.scene import Scene
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, Float64Array, Int64Array
+
+
+def frame_rewards(
+    scene: Scene, collided: BoolArray, failed: BoolArray, frames: Int64Array, config: ArenaConfig
+) -> tuple[Float32Array, BoolArray]:
+    """Rewards [N, K] of a frame of N arenas, and in which of them it is success [N].
+
+    scene: of all the arenas [N, ...], after the frame's moves. collided, failed: [N, K]. frames: f
+    of the paper [N], 1 after the first move. A robot that collided gets collision_reward, wherever
+    it stands; one that failed is paid like any other, and success does not wait for it.
+    """
+    rewards = np.empty(collided.shape, np.float32)
+    success = np.empty(len(collided), np.bool_)
+    _judge_all(
+        scene.robots,
+        scene.targets,
+        collided,
+        failed,
+        frames,
+        config.success_radius_px,
+        on_target_px(config),
+        config.proximity_weight,
+        config.f_max,
+        (config.success_reward, config.collision_reward, config.step_reward),
+        rewards,
+        success,
+    )
+    return rewards, success
+
+
+def target_distances_px(scene: Scene) -> Float64Array:
+    """chi: distances [K, M] of the robots' centres from the targets'."""
+    gaps = scene.robots[:, None, :2] - scene.targets[None]
+    distances: Float64Array = np.sqrt((gaps * gaps).sum(axis=2))
+    return distances
+
+
+def on_target_px(config: ArenaConfig) -> float:
+    """sqrt(s_w^2 + s_h^2 + c_r) as printed: nearer than this is "on" a target."""
+    return math.sqrt(2 * config.target_size_px**2 + config.robot_radius_px)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _judge_all(  # type: ignore[no-untyped-def]
+    robots,
+    targets,
+    collided,
+    failed,
+    frames,
+    delta,
+    reach,
+    proximity,
+    f_max,
+    paid,
+    rewards,
+    success,
+):
+    success_reward, collision_reward, step_reward = paid
+    num_robots, num_targets = robots.shape[1], targets.shape[1]
+    distances = np.empty((num_robots, num_targets), np.float64)
+    for n in range(len(robots)):
+        for i in range(num_robots):
+            for j in range(num_targets):
+                across = robots[n, i, 0] - targets[n, j, 0]
+                along = robots[n, i, 1] - targets[n, j, 1]
+                distances[i, j] = math.sqrt(across * across + along * along)
+        success[n] = not collided[n].any() and _each_has_its_own(distances, delta, failed[n])
+        frames_left = 1 - min(frames[n], f_max) / f_max
+        for i in range(num_robots):
+            nearest = distances[i].min()
+            if success[n]:
+                rewards[n, i] = success_reward
+            elif collided[n, i]:
+                rewards[n, i] = collision_reward
+            elif nearest < reach:
+                rewards[n, i] = (1 - nearest / reach) * proximity + frames_left * (1 - proximity)
+            else:
+                rewards[n, i] = step_reward
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _each_has_its_own(distances, delta, failed):  # type: ignore[no-untyped-def]
+    """Whether every robot [K] that works has a target [M] nearer than delta for itself."""
+    num_robots, num_targets = distances.shape
+    for robot in range(num_robots):
+        if not failed[robot] and distances[robot].min() >= delta:
+            return False
+    owners = np.full(num_targets, -1, np.int64)
+    tried = np.empty(num_targets, np.bool_)
+    for robot in range(num_robots):
+        tried[:] = False
+        if not failed[robot] and not _seat(robot, distances, delta, owners, tried):
+            return False
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _seat(robot, distances, delta, owners, tried):  # type: ignore[no-untyped-def]
+    """Gives the robot a target, moving owners on where that helps (an augmenting path)."""
+    for target in range(len(owners)):
+        if distances[robot, target] < delta and not tried[target]:
+            tried[target] = True
+            if owners[target] < 0 or _seat(owners[target], distances, delta, owners, tried):
+                owners[target] = robot
+                return True
+    return False

@@ -1,0 +1,51 @@
+"""The one configuration of a run: its schema, where it is loaded from, and its TOML form."""
+
+from mrcdrl.common.config.load import (
+    ENV_PREFIX,
+    EXTENDS,
+    apply_overrides,
+    environment_overrides,
+    load_config,
+    load_transport,
+    preset_names,
+    validate_config,
+)
+from mrcdrl.common.config.schema import (
+    ActorConfig,
+    AgentConfig,
+    ArenaConfig,
+    Config,
+    EvaluatorConfig,
+    ExplorationConfig,
+    LearnerConfig,
+    ReplayConfig,
+    RunConfig,
+    Section,
+    TransportConfig,
+    sections,
+)
+from mrcdrl.common.config.toml import to_toml
+
+__all__ = [
+    "ENV_PREFIX",
+    "EXTENDS",
+    "ActorConfig",
+    "AgentConfig",
+    "ArenaConfig",
+    "Config",
+    "EvaluatorConfig",
+    "ExplorationConfig",
+    "LearnerConfig",
+    "ReplayConfig",
+    "RunConfig",
+    "Section",
+    "TransportConfig",
+    "apply_overrides",
+    "environment_overrides",
+    "load_config",
+    "load_transport",
+    "preset_names",
+    "sections",
+    "to_toml",
+    "validate_config",
+]

@@ -1,0 +1,86 @@
+"""Command-line flags made from the configuration's schema; an unknown one gets the nearest name.
+
+Invariants: `--section.field VALUE` exists for every field, with its description; values are
+checked by the schema, not here.
+"""
+
+import argparse
+import difflib
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from typing import NoReturn
+
+from mrcdrl.common.config import sections
+
+_DEST = "config:"
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser that takes no abbreviations and suggests the nearest flag.
+
+    Flags may stand between the arguments of a list.
+    """
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        kwargs.setdefault("allow_abbrev", False)
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        parsed, unknown = self.parse_known_intermixed_args(args, namespace)
+        if unknown:
+            self._refuse(unknown[0])
+        return parsed
+
+    def _refuse(self, argument: str) -> NoReturn:
+        name = argument.split("=")[0]
+        known = [option for action in self._actions for option in action.option_strings]
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        self.error(f"unknown argument {name}" + (f"; did you mean {near[0]}?" if near else ""))
+
+    def error(self, message: str) -> NoReturn:
+        """One line, exit code 2."""
+        sys.stderr.write(f"mrcdrl: {message} (see {self.prog} --help)\n")
+        raise SystemExit(2)
+
+
+def add_config_flags(
+    parser: argparse.ArgumentParser,
+    short: Mapping[str, str] | None = None,
+    *,
+    only: Sequence[str] = (),
+) -> None:
+    """A flag for every field of the configuration.
+
+    short: shorter spellings, such as {"arena.num_robots": "--robots"}. only: these sections.
+    """
+    shorter = short or {}
+    for section, model in sections().items():
+        if only and section not in only:
+            continue
+        group = parser.add_argument_group(f"[{section}]")
+        for name, info in model.model_fields.items():
+            text = re.sub(r"\s+", " ", info.description or "").replace("%", "%%")
+            default = re.sub(r"\s+", "", str(info.default)).replace("%", "%%")
+            field = f"{section}.{name}"
+            spellings = dict.fromkeys((f"--{field}", f"--{field}".replace("_", "-")))
+            if field in shorter:
+                spellings[shorter[field]] = None
+            group.add_argument(
+                *spellings,
+                dest=f"{_DEST}{field}",
+                metavar="X",
+                help=f"{text} Default: {default}",
+            )
+
+
+def overrides(namespace: argparse.Namespace) -> dict[str, str]:
+    """The configuration flags that were given: "section.field" to text."""
+    return {
+        key.removeprefix(_DEST): value
+        for key, value in vars(namespace).items()
+        if key.startswith(_DEST) and value is not None
+    }

@@ -1,0 +1,1 @@
+"""The messages that cross a process boundary, and their bytes."""

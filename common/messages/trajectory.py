@@ -1,0 +1,262 @@
+"""The nouns of the data path: what an actor records, what replay keeps, what a learner reads.
+
+Invariants: every array's dtype and shape is declared here and nowhere else; instances are
+frozen; nothing here knows of a clock, a lock or a transport.
+
+Shapes: H = frames stacked in one state - 1, T = transitions of a chunk, n = longest n-step
+return, W = H + 1 + n records that one transition may touch, B = transitions of a batch,
+K = robots of an arena, A = arenas, R = bytes of one observation record.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from typing import Any, Self
+
+import numpy as np
+
+# in full, since numpy.typing.NDArray hides its dtype from version 2.5 on, where it is an alias
+UInt8Array = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
+Float32Array = np.ndarray[tuple[Any, ...], np.dtype[np.float32]]
+Float64Array = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+Int64Array = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+
+NUM_ACTIONS = 3  # left, straight, right (paper section 3)
+NO_SLOT = -1  # of an actor to which no slot of exploration is leased
+
+
+class StepType(IntEnum):
+    """Position of a time step in its episode (dm_env's terms)."""
+
+    FIRST = 0
+    MID = 1
+    LAST = 2
+
+
+class Outcome(StrEnum):
+    """How an episode ended."""
+
+    SUCCESS = "success"
+    COLLISION = "collision"
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True, slots=True)
+class TimeStep:
+    """What one arena returns for all of its robots after a reset or a step."""
+
+    step_type: StepType
+    records: UInt8Array  # [K, R], one observation record a robot
+    rewards: Float32Array  # [K], zero at FIRST
+    discount: float  # 0 after a termination (success, failure), else 1; gamma is the agent's
+    collided: BoolArray  # [K], whose move was undone in this frame
+    hit_wall: BoolArray  # [K], of those that collided, whose way led into a wall or obstacle
+    outcome: Outcome | None = None  # set at LAST
+
+    @property
+    def first(self) -> bool:
+        return self.step_type is StepType.FIRST
+
+    @property
+    def last(self) -> bool:
+        return self.step_type is StepType.LAST
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSteps:
+    """What arenas stepped together return, after a step: the time steps of A arenas."""
+
+    records: UInt8Array  # [A, K, R]
+    rewards: Float32Array  # [A, K]
+    collided: BoolArray  # [A, K]
+    hit_wall: BoolArray  # [A, K]
+    outcomes: tuple[Outcome | None, ...]  # A, set at LAST
+
+    def __iter__(self) -> Iterator[TimeStep]:
+        return (self[arena] for arena in range(len(self.outcomes)))
+
+    def __getitem__(self, arena: int) -> TimeStep:
+        """Of one arena."""
+        outcome = self.outcomes[arena]
+        terminated = outcome is not None and outcome is not Outcome.TIMEOUT
+        return TimeStep(
+            step_type=StepType.MID if outcome is None else StepType.LAST,
+            records=self.records[arena],
+            rewards=self.rewards[arena],
+            discount=0.0 if terminated else 1.0,
+            collided=self.collided[arena],
+            hit_wall=self.hit_wall[arena],
+            outcome=outcome,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Consecutive transitions of one robot that stand alone: history before, bootstrap after.
+
+    Transition t (0 <= t < T) has state records[t : t + H + 1], action actions[t], n-step return
+    rewards[t], and bootstraps with discounts[t] from the state
+    records[t + k : t + k + H + 1], k = bootstrap_offsets[t]. At an episode's start its first
+    record, and at its end its last, is repeated to fill the window.
+    """
+
+    actor: str
+    incarnation: int  # differs for every start of the same actor
+    sequence: int  # 0, 1, 2, … without gaps within an incarnation
+    weights_version: int  # the oldest version that chose one of these actions
+    records: UInt8Array  # [H + T + n, R]
+    actions: UInt8Array  # [T]
+    rewards: Float32Array  # [T], sum of k discounted rewards
+    discounts: Float32Array  # [T], gamma**k, or 0 where the episode terminated
+    bootstrap_offsets: UInt8Array  # [T], k, 1..n
+    priorities: Float32Array  # [T], initial priorities (absolute TD errors), or [0]
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Transitions drawn from the table, still as records."""
+
+    keys: Int64Array  # [B], names the transition for a priority update
+    probabilities: Float64Array  # [B], of having been drawn
+    table_size: int  # transitions in the table when drawn
+    total_priority: float  # of them, to the power alpha; their number where sampling is uniform
+    actions: UInt8Array  # [B]
+    rewards: Float32Array  # [B]
+    discounts: Float32Array  # [B]
+    bootstrap_offsets: UInt8Array  # [B]
+    weights_versions: Int64Array  # [B], of the chunk the transition came from
+    records: UInt8Array  # [B, W, R]; last, so that a message of it can be made around it
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True, slots=True)
+class InsertReply:
+    """Replay's acknowledgement: the chunk is stored (or was before)."""
+
+    sequence: int
+    duplicate: bool
+    inserts: int  # transitions accepted since the run began
+
+
+@dataclass(frozen=True, slots=True)
+class Priorities:
+    """What a learner found of transitions it sampled; of a key given twice the last counts."""
+
+    keys: Int64Array  # [B], of Samples
+    priorities: Float32Array  # [B], absolute TD errors
+
+
+@dataclass(frozen=True, slots=True)
+class PrioritiesReply:
+    """Replay's acknowledgement of priorities."""
+
+    updated: int
+    ignored: int  # of transitions evicted meanwhile; all of them where sampling is uniform
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseRequest:
+    """An actor's wish for a slot of exploration: a first one, its own again, or to give it back."""
+
+    actor: str
+    incarnation: int  # differs for every start of the actor
+    slot: int  # it had last; NO_SLOT where it had none
+    holds: bool  # by its own clock that slot is its own still
+    ends: bool  # it needs none any more
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseReply:
+    """Replay's answer: the slot that is the actor's own for `lease_s` from when it asked."""
+
+    slot: int  # NO_SLOT: none now, ask again
+    rank: int  # its place on the ladder
+    num_places: int  # of the ladder
+    lease_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """The network's parameters as published; newer means a larger (epoch, version).
+
+    Make them by `of`; one whose digest is not the payload's is torn, and the wire refuses it.
+    """
+
+    epoch: int  # rises when a run's learner starts from new parameters
+    version: int  # rises with every publication, also over restarts
+    learner_step: int
+    payload: bytes  # safetensors: arrays by parameter name, all of one precision
+    digest: str  # SHA-256 of the payload, hexadecimal
+
+    @classmethod
+    def of(cls, epoch: int, version: int, learner_step: int, payload: bytes) -> Self:
+        """With the digest of this payload."""
+        return cls(epoch, version, learner_step, payload, hashlib.sha256(payload).hexdigest())
+
+    @property
+    def order(self) -> tuple[int, int]:
+        return (self.epoch, self.version)
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSummary:
+    """One finished training episode."""
+
+    actor: str
+    arena: int
+    episode: int  # counts this actor's episodes
+    outcome: Outcome
+    frames: int  # env steps of the episode
+    score: float  # sum of rewards, mean over robots (Fig. 6a)
+    collisions: int
+    epsilon: float
+    weights_version: int
+    mean_q: float  # mean over the episode of the greedy action's value (Fig. 7a-c)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Result of the paper's test (section 5.3) for one version of the weights."""
+
+    worker: str
+    weights_epoch: int
+    weights_version: int
+    learner_step: int
+    num_robots: int
+    episodes: int
+    success_rate: float
+    collision_rate: float
+    timeout_rate: float
+    success_interval: tuple[float, float]  # 95 % Wilson interval of success_rate
+    max_per_100: float
+    mean_per_100: float
+    variance_per_100: float
+    mean_frames: float  # to success
+    mean_score: float
+    seed: int
+    wall_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """What a service says of itself once a second; the metrics' names are in docs/metrics.md."""
+
+    role: str
+    id: str
+    metrics: dict[str, float]
+    text: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRequest:
+    """A learner's wish for mini-batches."""
+
+    batch_size: int
+    learner_step: int = -1  # of a run that takes turns: drawn for the step after so many

@@ -1,0 +1,337 @@
+"""Messages to bytes and back, both pure; docs/wire.md describes the same for other languages.
+
+A message is one msgpack map: its fields by name, and `schema`, the message's name and version.
+A number array is a pair [shape, bytes], C order, little-endian, of the dtype that
+`trajectory.py` declares; a large one follows the map (`framing.py`), and the pair is [shape, place
+among what follows]. Invariants: what `decode` returns has exactly the declared
+types, dtypes and mutually fitting shapes; any other bytes raise WireError with the reason; large
+arrays are copied neither way.
+"""
+
+import enum
+import hashlib
+import math
+import types
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgpack
+import numpy as np
+
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.framing import Part, join_map, padded, split_map
+from mrcdrl.common.messages.trajectory import (
+    NO_SLOT,
+    NUM_ACTIONS,
+    Chunk,
+    EpisodeSummary,
+    Evaluation,
+    Float32Array,
+    InsertReply,
+    LeaseReply,
+    LeaseRequest,
+    Priorities,
+    PrioritiesReply,
+    SampleRequest,
+    Samples,
+    Stats,
+    Weights,
+)
+from mrcdrl.common.runtime.names import MAX_NAME
+
+M = TypeVar("M")
+_MAX_NDIM = 8
+_LARGE_BYTES = 8192  # of an array that follows the map
+
+
+def _check_chunk(chunk: Chunk) -> str | None:
+    arrays = (chunk.rewards, chunk.discounts, chunk.bootstrap_offsets)
+    if any(a.ndim != 1 for a in (chunk.actions, *arrays, chunk.priorities)):
+        return "actions, rewards, discounts, bootstrap_offsets and priorities are vectors"
+    length = len(chunk.actions)
+    if length == 0 or any(len(a) != length for a in arrays):
+        return "actions, rewards, discounts and bootstrap_offsets differ in length, or are empty"
+    if len(chunk.priorities) not in (0, length):
+        return "priorities has neither no entry nor one a transition"
+    if chunk.records.ndim != 2 or chunk.records.shape[0] <= length:
+        return "records is no matrix with more rows than there are transitions"
+    if not (np.isfinite(chunk.rewards).all() and np.isfinite(chunk.discounts).all()):
+        return "a reward or discount is not finite"
+    if not _may_be_errors(chunk.priorities):
+        return "a priority is negative or not finite"
+    if chunk.actions.max() >= NUM_ACTIONS:
+        return f"an action is none of {NUM_ACTIONS}"
+    if chunk.bootstrap_offsets.min() < 1:
+        return "a bootstrap offset is 0"
+    if chunk.sequence < 0 or chunk.weights_version < 0:
+        return "sequence or weights_version is negative"
+    if len(chunk.actor) > MAX_NAME:  # replay remembers it
+        return f"actor has more than {MAX_NAME} characters"
+    return None
+
+
+def _check_samples(samples: Samples) -> str | None:
+    vectors = (
+        samples.keys,
+        samples.probabilities,
+        samples.actions,
+        samples.rewards,
+        samples.discounts,
+        samples.bootstrap_offsets,
+        samples.weights_versions,
+    )
+    if samples.records.ndim != 3 or any(v.ndim != 1 for v in vectors):
+        return "records is no array of 3 dimensions, or another is no vector"
+    if any(len(v) != len(samples.records) for v in vectors):
+        return "arrays differ in length"
+    if not ((samples.probabilities > 0).all() and (samples.probabilities <= 1).all()):
+        return "a probability is not above 0 and at most 1"
+    if not 0 < samples.total_priority < math.inf:
+        return "total_priority is not above 0 and finite"
+    return None
+
+
+def _check_priorities(message: Priorities) -> str | None:
+    if message.keys.ndim != 1 or message.keys.shape != message.priorities.shape:
+        return "keys and priorities are no vectors of one length"
+    if not _may_be_errors(message.priorities):
+        return "a priority is negative or not finite"
+    return None
+
+
+def _check_lease_request(request: LeaseRequest) -> str | None:
+    if len(request.actor) > MAX_NAME:  # replay remembers it
+        return f"actor has more than {MAX_NAME} characters"
+    if request.slot < NO_SLOT:
+        return f"slot is below {NO_SLOT}"
+    if request.holds and request.slot == NO_SLOT:
+        return "it holds a slot and names none"
+    return None
+
+
+def _check_lease_reply(reply: LeaseReply) -> str | None:
+    if reply.slot < NO_SLOT:
+        return f"slot is below {NO_SLOT}"
+    if not 0 <= reply.rank < reply.num_places:
+        return f"rank {reply.rank} is none of {reply.num_places} places"
+    if not 0 < reply.lease_s < math.inf:
+        return "lease_s is not above 0 and finite"
+    return None
+
+
+def _check_weights(weights: Weights) -> str | None:
+    if hashlib.sha256(weights.payload).hexdigest() != weights.digest:
+        return "the payload is not what its digest says: torn or altered"
+    return None
+
+
+def _may_be_errors(priorities: Float32Array) -> bool:
+    """Whether these are absolute TD errors."""
+    return bool(np.isfinite(priorities).all() and (priorities >= 0).all())
+
+
+_SCHEMAS: dict[type, str] = {
+    Chunk: "chunk/1",
+    InsertReply: "insert_reply/1",
+    SampleRequest: "sample_request/2",
+    Samples: "samples/2",
+    Priorities: "priorities/1",
+    PrioritiesReply: "priorities_reply/1",
+    LeaseRequest: "lease_request/1",
+    LeaseReply: "lease_reply/1",
+    Weights: "weights/2",
+    EpisodeSummary: "episode/1",
+    Evaluation: "evaluation/1",
+    Stats: "stats/1",
+}
+_CHECKS: dict[type, Callable[[Any], str | None]] = {
+    Chunk: _check_chunk,
+    Samples: _check_samples,
+    Priorities: _check_priorities,
+    LeaseRequest: _check_lease_request,
+    LeaseReply: _check_lease_reply,
+    Weights: _check_weights,
+}
+
+
+def encode(message: Any) -> bytes:
+    """The bytes of any message of the schema."""
+    return b"".join(encode_parts(message))
+
+
+def encode_parts(message: Any) -> list[Part]:
+    """The same bytes in parts; large arrays are views of the message's memory, in order."""
+    table: dict[str, Any] = {"schema": _SCHEMAS[type(message)]}
+    large: list[memoryview] = []
+    place = 0
+    for field in fields(message):
+        value = getattr(message, field.name)
+        if isinstance(value, np.ndarray):
+            little = value.astype(value.dtype.newbyteorder("<"), order="C", copy=False)
+            if little.nbytes < _LARGE_BYTES:
+                value = [list(value.shape), little.tobytes()]
+            else:
+                value = [list(value.shape), place]
+                large.append(little.reshape(-1).view(np.uint8).data)
+                place += padded(little.nbytes)
+        table[field.name] = value
+    return join_map(msgpack.packb(table), large)
+
+
+def decode(cls: type[M], data: Part) -> M:
+    """The message of class `cls` that `data` holds; its arrays are read-only views of `data`.
+
+    Raises WireError, with the reason, for whatever `encode` would not have written.
+    """
+    packed, arrays = split_map(memoryview(data).toreadonly())
+    try:
+        table = msgpack.unpackb(packed, raw=False, strict_map_key=True, use_list=True)
+    except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
+        raise WireError(f"no msgpack: {type(error).__name__}") from error
+    if not isinstance(table, dict):
+        raise WireError("not a map")
+    schema = table.pop("schema", None)
+    if schema != _SCHEMAS[cls]:
+        given = schema[:40] if isinstance(schema, str) else type(schema).__name__
+        raise WireError(f"schema {given!r} where {_SCHEMAS[cls]!r} is due")
+    readers = _READERS[cls]
+    if table.keys() != readers.keys():
+        odd = sorted(map(str, table.keys() ^ readers.keys()))
+        raise WireError(f"missing or unknown fields: {', '.join(odd)[:120]}")
+    values, end = {}, 0
+    for name, read in readers.items():
+        value = table[name]
+        is_large = name in _ARRAYS[cls] and _follows(value)
+        try:
+            if is_large:
+                value = [value[0], _begin(arrays, value[1], padded(end))]
+            values[name] = read(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise WireError(f"{name}: {error}") from error
+        if is_large:
+            end = padded(end) + values[name].nbytes
+    if end != len(arrays):
+        raise WireError(f"{len(arrays)} bytes after the map, of which {end} are arrays")
+    message = cls(**values)
+    check = _CHECKS.get(cls)
+    if check is not None and (reason := check(message)) is not None:
+        raise WireError(reason)
+    return message
+
+
+def _follows(value: Any) -> bool:
+    """Whether this is the pair of an array after the map."""
+    return isinstance(value, list) and len(value) == 2 and type(value[1]) is int
+
+
+def _begin(arrays: memoryview, place: int, due: int) -> memoryview:
+    """What begins at a place; ValueError unless it is where the next array is due."""
+    if place != due:
+        raise ValueError(f"an array at {place} where {due} is due")
+    return arrays[place:]
+
+
+def _readers_of(cls: type) -> dict[str, Callable[[Any], Any]]:
+    hints = get_type_hints(cls)
+    return {field.name: _reader(hints[field.name]) for field in fields(cls)}
+
+
+def _reader(hint: Any) -> Callable[[Any], Any]:
+    """A function from the unpacked value to the declared type; raises TypeError or ValueError."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is np.ndarray:
+        return _array_reader(np.dtype(get_args(args[1])[0]))
+    if origin in (Union, types.UnionType):
+        inner = _reader(next(a for a in args if a is not type(None)))
+        return lambda value: None if value is None else inner(value)
+    if origin is tuple:
+        return _tuple_reader([_reader(a) for a in args])
+    if origin is dict:
+        return _dict_reader(_reader(args[1]))
+    if isinstance(hint, type) and issubclass(hint, enum.StrEnum):
+        return _enum_reader(hint)
+    if hint is float:
+        return _read_float
+    if hint is int:
+        return _read_int
+    return _exact(hint)
+
+
+def _array_reader(dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if not (isinstance(value, list) and len(value) == 2):
+            raise TypeError("no pair [shape, bytes]")
+        shape, data = value
+        if not isinstance(data, Part) or not isinstance(shape, list) or len(shape) > _MAX_NDIM:
+            raise TypeError("no pair [shape, bytes]")
+        if any(type(n) is not int or n < 0 for n in shape):
+            raise ValueError("a length in the shape is no natural number")
+        length = math.prod(shape) * dtype.itemsize
+        if isinstance(data, memoryview) and length <= len(data):
+            data = data[:length]
+        if length != len(data):
+            raise ValueError(f"shape {shape} of {dtype} does not fit {len(data)} bytes")
+        little = np.frombuffer(data, dtype.newbyteorder("<")).reshape(shape)
+        return little.astype(dtype, copy=False)
+
+    return read
+
+
+def _tuple_reader(readers: list[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if not isinstance(value, list) or len(value) != len(readers):
+            raise TypeError(f"no list of {len(readers)}")
+        return tuple(r(v) for r, v in zip(readers, value, strict=True))
+
+    return read
+
+
+def _dict_reader(reader: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict) or any(type(k) is not str for k in value):
+            raise TypeError("no map with names")
+        return {k: reader(v) for k, v in value.items()}
+
+    return read
+
+
+def _enum_reader(expected: type[enum.StrEnum]) -> Callable[[Any], Any]:
+    members = {str(member): member for member in expected}
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, str) or value not in members:
+            raise TypeError(f"none of {', '.join(members)}")
+        return members[value]
+
+    return read
+
+
+def _read_float(value: Any) -> float:
+    if type(value) not in (float, int):
+        raise TypeError("no number")
+    return float(value)
+
+
+def _read_int(value: Any) -> int:
+    if type(value) is not int:
+        raise TypeError("no integer")
+    if not -(2**63) <= value < 2**63:
+        raise ValueError("integer outside 64 bits")
+    return value
+
+
+def _exact(expected: type) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
+        if type(value) is not expected:
+            raise TypeError(f"no {expected.__name__}")
+        return value
+
+    return read
+
+
+_READERS = {cls: _readers_of(cls) for cls in _SCHEMAS}
+_ARRAYS = {
+    cls: {name for name, hint in get_type_hints(cls).items() if get_origin(hint) is np.ndarray}
+    for cls in _SCHEMAS
+}

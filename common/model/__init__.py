@@ -1,0 +1,1 @@
+"""The Q-network, its weights, and the policy that acts by it."""

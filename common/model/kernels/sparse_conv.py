@@ -1,0 +1,126 @@
+"""The network's first layer on mostly black images: convolution, max-pool and ReLU in one.
+
+A black pixel adds nothing to a convolution, and of an arena's images 92 to 96 % are black: what
+is left is a twelfth of the products, or less. Images with more light in them go through torch's
+own operations (`common/model/q_network.py`), which are then faster.
+
+Invariants: the values are those of torch's operations within float32's rounding; the same images
+and parameters give the same bits.
+
+Shapes: B = states, S = images of a state, V = their width, C = channels, P = width when pooled.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array
+from mrcdrl.common.model.kernels.sparse_conv_loops import (
+    CHANNELS,
+    KERNEL,
+    TAPS,
+    differentiate,
+    layer,
+    list_nonzero,
+)
+
+MAX_NONZERO: Final = 0.25  # of all pixels; with more, torch's operations are faster
+
+
+def pooled_px(view_px: int) -> int:
+    """Width of what the layer gives for images of this width, once it is pooled."""
+    return ((view_px - KERNEL) // 2 + 1) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class NonzeroPixels:
+    """The pixels of states that are not black, row after row."""
+
+    shape: tuple[int, int, int]  # B, S, V
+    ends: NDArray[np.int32]  # [B S V + 1]: those of row i are ends[i] to ends[i + 1]
+    columns: UInt8Array
+    intensities: Float32Array
+
+
+def nonzero_pixels(observation: Tensor) -> NonzeroPixels | None:
+    """Those of states uint8 [B, S, V, V] on the CPU; None where they are more than MAX_NONZERO."""
+    images: UInt8Array = observation.numpy()
+    num, stack, size, _ = images.shape
+    if images.strides[3] != 1:
+        images = np.ascontiguousarray(images)
+    most = int(MAX_NONZERO * images.size)
+    columns, intensities = np.empty(most, np.uint8), np.empty(most, np.float32)
+    ends = np.zeros(num * stack * size + 1, np.int32)
+    words = images.view(np.uint32) if size % 4 == 0 else images
+    if not list_nonzero(images, words, ends, columns, intensities):
+        return None
+    return NonzeroPixels((num, stack, size), ends, columns, intensities)
+
+
+def first_layer(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
+    """max(0, max-pool(convolution)), float32 [B, C, P, P], channels last in memory.
+
+    weight: float32 [C, S, 5, 5], of intensities as they are; bias: float32 [C].
+    """
+    if torch.is_grad_enabled() and weight.requires_grad:
+        outputs: Tensor = _FirstLayer.apply(nonzero, weight, bias)  # type: ignore[no-untyped-call]
+        return outputs
+    return _forward(nonzero, weight, bias)[0]
+
+
+class _FirstLayer(torch.autograd.Function):
+    """With the gradients of weight and bias; images have none."""
+
+    @staticmethod
+    def forward(ctx: Any, nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
+        pooled, largest = _forward(nonzero, weight, bias)
+        ctx.nonzero = nonzero
+        ctx.save_for_backward(pooled, largest)
+        return pooled
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor, Tensor]:
+        nonzero: NonzeroPixels = ctx.nonzero
+        _, stack, size = nonzero.shape
+        taps = np.zeros((stack, KERNEL, KERNEL, CHANNELS), np.float32)
+        bias = np.zeros(CHANNELS, np.float32)
+        passed, pooled, largest = map(_channels_last, (gradient, *ctx.saved_tensors))
+        pixels = (nonzero.ends, nonzero.columns, nonzero.intensities, size)
+        differentiate(*pixels, passed, pooled, largest, taps, bias)
+        weight = torch.from_numpy(taps)[:, :, _COLUMNS].permute(3, 0, 1, 2)
+        return None, weight, torch.from_numpy(bias)
+
+
+_COLUMNS = np.argsort(TAPS).tolist()
+
+
+def _forward(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """The outputs, and which of the four each is the largest of, uint8; both [B, C, P, P]."""
+    num, stack, size = nonzero.shape
+    side = pooled_px(size)
+    pooled = torch.empty(num, side, side, CHANNELS)
+    largest = torch.empty(num, side, side, CHANNELS, dtype=torch.uint8)
+    taps = weight.detach().permute(1, 2, 3, 0)[:, :, list(TAPS)].contiguous()
+    inputs = (
+        nonzero.ends,
+        nonzero.columns,
+        nonzero.intensities,
+        stack,
+        size,
+        taps.numpy(),
+        bias.detach().numpy(),
+    )
+    layer(*inputs, pooled.numpy(), largest.numpy())
+    return pooled.permute(0, 3, 1, 2), largest.permute(0, 3, 1, 2)
+
+
+def _channels_last(x: Tensor) -> NDArray[Any]:
+    """A tensor [B, C, P, P] as an array [B, P, P, C] without gaps."""
+    array: NDArray[Any] = x.detach().permute(0, 2, 3, 1).contiguous().numpy()
+    return array

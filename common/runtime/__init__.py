@@ -1,0 +1,1 @@
+"""What every process needs: signals, files, the heartbeat, names."""

@@ -1,0 +1,62 @@
+"""Files that are there wholly or not at all, and the weights kept in them.
+
+Invariants: a name is given to a file only when its bytes are on the disk; what a failed or
+killed write leaves behind never bears the final name; no torch here.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+
+TEMPORARY_SUFFIX = ".part"
+RUN_CONFIG = "config.toml"  # of a run's folder, like the next
+BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"
+
+
+def write_synced(path: Path, content: bytes, mode: int = 0o644) -> None:
+    """Write a new file and wait until it is on the disk; raises OSError.
+
+    mode: who may read and write it, from its first byte on.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
+    try:
+        remaining = memoryview(content)
+        while remaining:
+            remaining = remaining[os.write(descriptor, remaining) :]
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_directory(path: Path) -> None:
+    """Wait until the names in a directory are on the disk; raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def atomic_write(path: Path, content: bytes, mode: int = 0o644) -> None:
+    """Write or replace a file in one step; on OSError the old one is as it was.
+
+    mode: as `write_synced` takes it. Two writers at once are safe, the last wins.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    try:
+        write_synced(temporary, content, mode)
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_directory(path.parent)
+
+
+def sha256(content: bytes) -> str:
+    """Hexadecimal digest."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def reason(error: OSError) -> str:
+    """Why, in a few words, such as "No space left on device"."""
+    return error.strerror or type(error).__name__

@@ -1,0 +1,126 @@
+"""Acting by a run that is up: whoever holds a LivePolicy acts by the run's newest weights.
+
+    with LivePolicy("four", "tcp/127.0.0.1:7447") as policy:
+        actions = policy.act(images)  # uint8 [N, V, V] in, uint8 [N] out
+
+Invariants: weights only ever get newer; those that are torn, altered or of another network are
+counted and dropped; only `act` adopts, so that all actions of a call are by one version. For one
+thread. Nothing is sent but two questions: for the configuration, and for the first weights.
+"""
+
+import contextlib
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrcdrl.common.config import load_transport
+from mrcdrl.common.errors import CheckpointError, DeadlineError
+from mrcdrl.common.messages.trajectory import UInt8Array, Weights
+from mrcdrl.common.model.policy import FrameStack, make_policy
+from mrcdrl.common.runtime.closing import Closing
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.joining import Joining, fetch_config
+from mrcdrl.common.sync.weights import WeightsReader
+from mrcdrl.common.transport import Session
+
+_LOG = logging.getLogger("live")
+
+
+class LivePolicy(Closing):
+    """Follows a run's weights and acts by them; use it in `with`.
+
+    run: its name. endpoint: where its replay service listens, such as tcp/HOST:7447. epsilon:
+    share of actions drawn at random, by the seed. timeout_s: for each of the endpoint, the
+    configuration and the first weights; DeadlineError or EndpointError says which did not come.
+    """
+
+    def __init__(
+        self,
+        run: str,
+        endpoint: str,
+        *,
+        epsilon: float = 0.0,
+        seed: int = 0,
+        timeout_s: float = 30.0,
+    ) -> None:
+        self._epsilon = epsilon
+        self._rng = np.random.default_rng(seed)
+        self._foreign = 0
+        self._fresh = np.ones(0, np.bool_)
+        self._adopted_s = time.monotonic()
+        transport = load_transport({}).model_copy(update={"connect": (endpoint,), "listen": ()})
+        stop = StopSignal()
+        joining = Joining(run, "live", Path(), transport, {})
+        with contextlib.ExitStack() as opened:
+            session = opened.enter_context(Session(transport, open_timeout_s=timeout_s))
+            self.config = fetch_config(session, joining, stop, timeout_s)
+            self._reader = WeightsReader(session, joining.keys)
+            self._policy = make_policy(self.config)
+            first = self._reader.wait(stop, timeout_s)
+            if first is None:
+                raise DeadlineError(
+                    f"no weights of run {run!r} came within {timeout_s:g} s; is its learner up?"
+                )
+            self._adopt(first)
+            self._opened = opened.pop_all()
+
+    def close(self) -> None:
+        """Leave the run; again is harmless."""
+        self._opened.close()
+
+    def __repr__(self) -> str:
+        return f"LivePolicy(version={self.version}, staleness_s={self.staleness_s:.1f})"
+
+    @property
+    def version(self) -> int:
+        """Of the weights acted by."""
+        return self._policy.weights_version
+
+    @property
+    def staleness_s(self) -> float:
+        """Seconds since they came."""
+        return time.monotonic() - self._adopted_s
+
+    @property
+    def refused(self) -> int:
+        """Weights that were torn, altered, too large or of another network."""
+        return self._reader.refused + self._foreign
+
+    def begin(self, robots: NDArray[np.integer] | slice = slice(None)) -> None:
+        """An episode of these robots begins: their next images follow on no others."""
+        self._fresh[robots] = True
+
+    def act(self, observations: UInt8Array) -> UInt8Array:
+        """Actions uint8 [N] of N robots by the newest weights: 0 left, 1 straight, 2 right.
+
+        observations: what they see now, uint8 [N, V, V], which is stacked on what they saw
+        before; or whole states, uint8 [N, S, V, V]. Another N begins anew for all robots.
+        """
+        newer = self._reader.latest()
+        if newer is not None:
+            try:
+                self._adopt(newer)
+            except CheckpointError as error:  # the old ones stay
+                self._foreign += 1
+                _LOG.warning("weights %d refused: %s", newer.version, error)
+        states = observations if observations.ndim == 4 else self._stacked(observations)
+        return self._policy.select_actions(states, self._epsilon, self._rng).actions
+
+    def _adopt(self, weights: Weights) -> None:
+        self._policy.adopt(weights)
+        self._adopted_s = time.monotonic()
+
+    def _stacked(self, images: UInt8Array) -> UInt8Array:
+        """States uint8 [N, S, V, V]; the first image of an episode stands for those before."""
+        if len(images) != len(self._fresh):
+            arena = self.config.arena
+            self._frames = FrameStack(len(images), arena.stack, arena.view_px)
+            self._fresh = np.ones(len(images), np.bool_)
+        follow, begin = np.flatnonzero(~self._fresh), np.flatnonzero(self._fresh)
+        self._frames.push(images[follow], follow)
+        self._frames.reset(begin, images[begin])
+        self._fresh[:] = False
+        return self._frames.stacks

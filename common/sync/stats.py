@@ -1,0 +1,44 @@
+"""The metrics that a service publishes about itself, once a second."""
+
+import logging
+import time
+from collections.abc import Callable
+
+from mrcdrl.common.errors import TransportError
+from mrcdrl.common.messages.trajectory import Stats
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.runtime.heartbeat import Heartbeat
+from mrcdrl.common.runtime.versions import versions
+from mrcdrl.common.transport import Publisher
+
+
+class StatsReporter:
+    """Publishes a service's metrics once a second, from its own main loop, and beats with it."""
+
+    def __init__(self, publisher: Publisher, role: str, worker: str) -> None:
+        self._publisher = publisher
+        self._role = role
+        self._worker = worker
+        self._text = {"incarnation": str(time.time_ns()), **versions()}
+        self._heartbeat = Heartbeat.of_environment()
+        self._due_s = 0.0
+
+    def worked(self, at_s: float | None = None) -> None:
+        """The service did something, or has nothing to do; `at_s`: then, by default now."""
+        self._heartbeat.worked(at_s)
+
+    def maybe(self, metrics: Callable[[], dict[str, float]]) -> None:
+        """Publish if a second has passed since the last time."""
+        if time.monotonic() >= self._due_s:
+            self.now(metrics)
+
+    def now(self, metrics: Callable[[], dict[str, float]]) -> None:
+        """Publish, and again in a second."""
+        self._due_s = time.monotonic() + 1.0
+        try:
+            numbers = {name: float(value) for name, value in metrics().items()}
+            text = {**self._text, "clock_ns": str(time.time_ns())}
+            self._publisher.put(encode(Stats(self._role, self._worker, numbers, text)))
+        except TransportError as error:
+            logging.getLogger(self._role).warning("stats not published: %s", error)
+        self._heartbeat.beat()

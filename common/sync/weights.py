@@ -1,0 +1,174 @@
+"""Live weights: the learner publishes, whoever joins late asks once, everyone holds the newest.
+
+Invariants: what a reader returns only ever gets newer, by (epoch, version); a message that is
+torn, altered or foreign is counted and dropped. Bytes in, bytes out: nothing here knows torch.
+"""
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+
+from mrcdrl.common.errors import TransportError, WireError
+from mrcdrl.common.messages.framing import Part
+from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.common.messages.wire import decode, encode
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport import PendingReply, Session
+from mrcdrl.common.transport.keys import Keys
+
+_LOG = logging.getLogger("weights")
+_TAKE_S = 0.2
+_ASK_AGAIN_S = 0.5
+_SILENCE_S = 20.0
+
+
+class WeightsWriter:
+    """Publishes weights, and answers late joiners with the newest, from threads of its own.
+
+    A subscriber that hangs holds up the publishing thread only; what became old meanwhile is
+    left out.
+    """
+
+    def __init__(self, session: Session, keys: Keys) -> None:
+        self._publisher = session.publisher(keys.weights)
+        self._server = session.server(keys.weights)
+        self._changed = threading.Condition()
+        self._newest: bytes | None = None
+        self._published: bytes | None = None
+        self._stopping = False
+        self._threads = [
+            threading.Thread(target=self._publish, name="weights-publish"),
+            threading.Thread(target=self._serve, name="weights-serve"),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def publish(self, weights: Weights) -> None:
+        """Hand over the newest weights; returns at once."""
+        payload = encode(weights)
+        with self._changed:
+            self._newest = payload
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Publish what is still to be published, then end both threads."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
+
+    def _publish(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._newest is not self._published or self._stopping
+                )
+                payload = self._newest
+                if payload is None or payload is self._published:
+                    return
+                self._published = payload
+            try:
+                self._publisher.put(payload)
+            except TransportError as error:
+                _LOG.warning("weights not published: %s", error)
+
+    def _serve(self) -> None:
+        while not self._stopping:
+            request = self._server.take(_TAKE_S)
+            if request is None:
+                continue
+            if self._newest is None:
+                request.throttle("no weights yet")
+            else:
+                request.reply(self._newest)
+
+
+class WeightsReader:
+    """Follows the newest weights of a run.
+
+    silence_s: without a publication for so long, the learner is asked: a link that was out may
+    come back with all but its subscriptions.
+    """
+
+    def __init__(self, session: Session, keys: Keys, *, silence_s: float = _SILENCE_S) -> None:
+        self._subscriber = session.latest_subscriber(keys.weights)
+        self._client = session.client(keys.weights, "the learner", timeout_s=2.0)
+        self._silence_s = silence_s
+        self._heard_s = time.monotonic()
+        self._asked: PendingReply | None = None
+        self._order = (-1, -1)
+        self._refused = 0
+
+    @property
+    def refused(self) -> int:
+        """Messages that were torn, altered, foreign or too large."""
+        return self._refused + self._subscriber.oversized
+
+    def latest(self, timeout_s: float = 0.0) -> Weights | None:
+        """Weights newer than the last returned; None where none came within the time."""
+        published = self._subscriber.take(timeout_s)
+        if published is None:
+            return self._newer(self._answer())
+        self._heard_s = time.monotonic()
+        return self._newer(published)
+
+    def wait(
+        self,
+        stop: StopSignal,
+        timeout_s: float = math.inf,
+        meanwhile: Callable[[], None] = lambda: None,
+    ) -> Weights | None:
+        """The first weights, asked for and listened for; None when stopped, or after the time.
+
+        meanwhile: called several times a second at best, every few seconds at worst.
+        """
+        told, deadline = False, time.monotonic() + timeout_s
+        while not stop.is_set() and time.monotonic() < deadline:
+            weights = self._newer(self._ask()) or self.latest(_ASK_AGAIN_S)
+            if weights is not None:
+                return weights
+            if not told:
+                _LOG.info("waiting for the learner's first weights")
+                told = True
+            meanwhile()
+        return None
+
+    def _answer(self) -> Part | None:
+        """To a question after a long silence, if it is there; asks where one is due."""
+        if self._asked is None:
+            if time.monotonic() - self._heard_s >= self._silence_s:
+                self._heard_s = time.monotonic()
+                with contextlib.suppress(TransportError):  # asked again when it is due
+                    self._asked = self._client.ask(b"")
+            return None
+        if not self._asked.wait(0.0):
+            return None
+        asked, self._asked = self._asked, None
+        try:
+            return asked.result()
+        except TransportError:
+            return None
+
+    def _ask(self) -> Part | None:
+        try:
+            return self._client.ask(b"").result()
+        except TransportError:
+            return None  # no learner yet; the caller asks again
+
+    def _newer(self, payload: Part | None) -> Weights | None:
+        if payload is None:
+            return None
+        try:
+            weights = decode(Weights, payload)
+        except WireError as error:
+            self._refused += 1
+            _LOG.warning("weights refused: %s", error)
+            return None
+        if weights.order <= self._order:
+            return None
+        self._order = weights.order
+        return weights

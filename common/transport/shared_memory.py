@@ -1,0 +1,209 @@
+"""Memory that a client lends to the peer it asks, so that large messages cross no network.
+
+A slot is a sealed memfd, named in a request by an address `<boot> <process> <descriptor> <token>`;
+the peer opens it through /proc, writes a large answer into it, or reads a large request from it.
+
+Invariants: a slot has no name in any file system, so nothing is left when either end is killed;
+only a sealed memfd of ours that begins with the token is ever mapped, and it cannot shrink under
+its reader; a slot carries one request and its answer at a time, and one whose answer did not come
+is never used again, because the peer may yet write to it. A peer that cannot open the slot
+(another host, user or container) is served over the network.
+"""
+
+import fcntl
+import logging
+import mmap
+import os
+import re
+import secrets
+import sys
+import weakref
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mrcdrl.common.errors import SharedMemoryError
+from mrcdrl.common.messages.framing import ALIGNMENT, Part
+
+_LOG = logging.getLogger("transport")
+LARGE_BYTES = 32 << 10  # below, the network is as fast
+_NAME = "mrcdrl-slot"
+_ADDRESS = re.compile(r"([0-9a-f-]{36}) (\d{1,10}) (\d{1,10}) ([0-9a-f]{32})")
+_TOKEN_BYTES = 16
+_MAX_MAPPED = 1024  # one or two a client; memory of the dead goes when the next is mapped
+_SEALS = (
+    fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL if sys.platform == "linux" else 0
+)
+
+
+class Slot:
+    """Memory for one request at a time; raises OSError where the system gives none."""
+
+    def __init__(self, size: int) -> None:
+        """size: bytes of `memory`, rounded up to whole pages."""
+        whole = -(-(ALIGNMENT + size) // mmap.PAGESIZE) * mmap.PAGESIZE
+        self._descriptor = os.memfd_create(_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            os.ftruncate(self._descriptor, whole)
+            fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, _SEALS)
+            self._map = mmap.mmap(self._descriptor, whole)
+        except OSError:
+            os.close(self._descriptor)
+            raise
+        weakref.finalize(self, os.close, self._descriptor)  # the map goes with its last view
+        token = secrets.token_bytes(_TOKEN_BYTES)
+        self._map[:_TOKEN_BYTES] = token
+        self.address = f"{_boot_id()} {os.getpid()} {self._descriptor} {token.hex()}"
+        self.memory = memoryview(self._map)[ALIGNMENT:]
+
+
+class Lender:
+    """The slots that a client lends one peer, as many as it has requests under way."""
+
+    def __init__(self, whom: str, *, enabled: bool) -> None:
+        """whom: the peer, in the log."""
+        self._whom = whom
+        self._free: list[Slot] = []
+        self.enabled = enabled and sys.platform == "linux"
+        self.near: bool | None = None
+        """Whether the peer can open them; None before it has answered once."""
+
+    def borrow(self, size: int) -> Slot | None:
+        """A slot of at least so many bytes; None where the peer is far or memory is short."""
+        if not self.enabled or self.near is False:
+            return None
+        for index, slot in enumerate(self._free):
+            if len(slot.memory) >= size:
+                return self._free.pop(index)
+        if self._free:  # too small for what is sent by now
+            self._free.pop()
+        try:
+            return Slot(size)
+        except OSError as error:
+            self._decide(near=False, why=f"no memory to share: {error.strerror}")
+            return None
+
+    def give_back(self, slot: Slot) -> None:
+        """Take a slot again that its peer no longer touches."""
+        self._free.append(slot)
+
+    def opened(self) -> None:
+        """The peer could open a slot."""
+        self._decide(near=True, why="")
+
+    def refused(self, why: str) -> None:
+        """The peer could not open a slot."""
+        self._decide(near=False, why=why)
+
+    def _decide(self, *, near: bool, why: str) -> None:
+        if near is self.near:
+            return
+        self.near = near
+        if near:
+            _LOG.info("large messages to and from %s go through shared memory", self._whom)
+        else:
+            self._free.clear()
+            _LOG.info("large messages to and from %s go over the network: %s", self._whom, why)
+
+
+class Slots:
+    """Slots of clients, opened by the peer they asked; for one thread."""
+
+    def __init__(self) -> None:
+        self._mapped: OrderedDict[str, memoryview] = OrderedDict()
+
+    def open(self, address: str) -> memoryview:
+        """The slot's memory; raises SharedMemoryError, saying why, where it is out of reach."""
+        memory = self._mapped.get(address)
+        if memory is None:
+            memory = _map(address)
+            self._forget_the_dead()
+            self._mapped[address] = memory
+        self._mapped.move_to_end(address)
+        while len(self._mapped) > _MAX_MAPPED:
+            self._mapped.popitem(last=False)
+        return memory
+
+    def _forget_the_dead(self) -> None:
+        for address in [a for a in self._mapped if not _is_slot(_path(a))]:
+            del self._mapped[address]
+
+
+def _boot_id() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+
+
+def _path(address: str) -> Path:
+    """Where this host shows the slot's memory; raises SharedMemoryError for another address."""
+    match = _ADDRESS.fullmatch(address)
+    if not match or sys.platform != "linux":
+        raise SharedMemoryError("no address of a slot")
+    if match[1] != _boot_id():
+        raise SharedMemoryError("another host")
+    return Path("/proc") / match[2] / "fd" / match[3]
+
+
+def _is_slot(path: Path) -> bool:
+    try:
+        return str(path.readlink()).startswith(f"/memfd:{_NAME}")
+    except OSError:
+        return False
+
+
+def _map(address: str) -> memoryview:
+    path = _path(address)
+    if not _is_slot(path):
+        raise SharedMemoryError("another container or user")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError as error:
+        raise SharedMemoryError(f"not to be opened: {error.strerror}") from error
+    try:
+        # Opened, it cannot be swapped for another file; sealed, it cannot shrink.
+        sealed = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & _SEALS == _SEALS
+        if not sealed or os.fstat(descriptor).st_size <= ALIGNMENT:
+            raise SharedMemoryError("no sealed memory")
+        mapped = mmap.mmap(descriptor, 0)
+    except (OSError, ValueError) as error:
+        raise SharedMemoryError(f"not to be mapped: {error}") from error
+    finally:
+        os.close(descriptor)
+    if mapped[:_TOKEN_BYTES].hex() != address.split()[-1]:
+        raise SharedMemoryError("memory of another process")
+    return memoryview(mapped)[ALIGNMENT:]
+
+
+def put(memory: memoryview, parts: Sequence[Part]) -> tuple[int, int] | None:
+    """Copy a message into memory, as (start, length); None where it does not fit.
+
+    A last part that lies in this memory already stays there, and the others go before it.
+    """
+    length = sum(map(len, parts))
+    there = _place_in(memory, parts[-1])
+    start = 0 if there is None else there - (length - len(parts[-1]))
+    if start < 0 or start + length > len(memory):
+        return None
+    place = start
+    for part in parts if there is None else parts[:-1]:
+        memory[place : place + len(part)] = part
+        place += len(part)
+    return start, length
+
+
+def room(memory: memoryview, size: int) -> memoryview | None:
+    """The last `size` bytes of memory, from a multiple of the alignment; None where it is short."""
+    start = (len(memory) - size) // ALIGNMENT * ALIGNMENT
+    return memory[start : start + size] if start >= 0 else None
+
+
+def _place_in(memory: memoryview, part: Part) -> int | None:
+    """Where in memory a part lies; None where it lies elsewhere."""
+    place = _address(part) - _address(memory)
+    return place if place >= 0 and place + len(part) <= len(memory) else None
+
+
+def _address(part: Part) -> int:
+    address: int = np.frombuffer(part, np.uint8).__array_interface__["data"][0]
+    return address

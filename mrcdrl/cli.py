@@ -1,0 +1,57 @@
+"""`mrcdrl …`: every command under one name; each is imported only when it is called."""
+
+import importlib
+import sys
+
+from mrcdrl.common.runtime.process import run_main
+
+_COMMANDS = {
+    "train": ("mrcdrl.services.train.main", "train on this machine: all processes, one command"),
+    "evaluate": ("mrcdrl.services.tools.evaluate", "the paper's test for weights or a controller"),
+    "render": ("mrcdrl.services.tools.render", "a film of evaluation episodes"),
+    "report": ("mrcdrl.services.tools.report", "the images and the film of a run"),
+    "figure": ("mrcdrl.services.tools.figure", "the paper's images of runs and controllers"),
+    "export": ("mrcdrl.services.tools.export", "weights as ONNX, torch.export or TorchScript"),
+    "config": ("mrcdrl.services.tools.config", "print the resolved configuration"),
+    "replay": ("mrcdrl.services.replay.main", "serve the replay table of a run"),
+    "replay inspect": ("mrcdrl.services.replay.inspect.main", "what the replay log of a run holds"),
+    "status": ("mrcdrl.services.status.main", "what a run that is up does, and what limits it"),
+    "doctor": (
+        "mrcdrl.services.tools.doctor.main",
+        "what this machine and a run lack, and how to mend it",
+    ),
+    "router": ("mrcdrl.services.router.main", "relay between the processes of runs"),
+    "certs": ("mrcdrl.services.tools.certs", "certificates for trials, one for each role"),
+    "actor": ("mrcdrl.services.actor.main", "collect for a run that is up"),
+    "simulate": ("mrcdrl.services.tools.simulate.main", "the load of many actors on replay"),
+    "learner": ("mrcdrl.services.learner.main", "learn for a run that is up"),
+    "evaluator": (
+        "mrcdrl.services.evaluator.main",
+        "judge the live weights of a run that is up",
+    ),
+}
+
+
+def main() -> int:
+    """Dispatch to a command; the exit code."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_usage())
+        return 0 if arguments else 2
+    words = 2 if " ".join(arguments[:2]) in _COMMANDS else 1
+    name = " ".join(arguments[:words])
+    if name not in _COMMANDS:
+        sys.stderr.write(f"mrcdrl: no command {name!r}; there are {', '.join(_COMMANDS)}\n")
+        return 2
+    command = importlib.import_module(_COMMANDS[name][0])
+    return run_main(lambda: command.main(arguments[words:]))
+
+
+def _usage() -> str:
+    lines = [f"  {name:<14} {text}" for name, (_, text) in _COMMANDS.items()]
+    head = "usage: mrcdrl COMMAND …   (mrcdrl COMMAND --help for its flags)"
+    return "\n".join([head, "", *lines])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

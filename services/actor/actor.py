@@ -1,0 +1,202 @@
+"""`mrcdrl actor`: join a run, follow its weights, collect, until told to stop."""
+
+import logging
+import time
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrcdrl.common.arena import make_arenas, make_codec
+from mrcdrl.common.config import Config
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.trajectory import Chunk, EpisodeSummary, Float32Array, Weights
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.model.exploration import epsilons
+from mrcdrl.common.model.policy import Policy, make_policy
+from mrcdrl.common.model.q_network import resolve_device
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.joining import Joining
+from mrcdrl.common.sync.lockstep import Lockstep
+from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.sync.weights import WeightsReader
+from mrcdrl.common.transport import Session
+from mrcdrl.services.actor.chunker import ChunkerConfig
+from mrcdrl.services.actor.collector import Collector
+from mrcdrl.services.actor.lease import WHOLE_LADDER, LeaseKeeper, Place
+from mrcdrl.services.actor.sender import Sender
+
+_LOG = logging.getLogger("actor")
+_LISTEN_S = 0.2
+
+
+class Actor:
+    """The shell around a collector."""
+
+    def __init__(
+        self,
+        config: Config,
+        joining: Joining,
+        session: Session,
+        sender: Sender,
+        lease: LeaseKeeper,
+    ) -> None:
+        keys, worker = joining.keys, joining.worker
+        self._config = config
+        self._worker = worker
+        self._sender = sender
+        self._lease = lease
+        self._reader = WeightsReader(session, keys)
+        self._episodes = session.publisher(keys.episodes(worker))
+        self._reporter = StatsReporter(
+            session.publisher(keys.stats("actor", worker)), "actor", worker
+        )
+        self._policy = make_policy(config, resolve_device(config.actor.device, "actor.device"))
+        self._collector = make_collector(config, worker, self._policy)
+        self._adopted_s = time.monotonic()
+        self._epsilons = self._explore(lease.place)
+        self._waited_s = 0.0
+        self._refused = 0  # weights of another network
+        self._started_s = time.monotonic()
+
+    def run(self, stop: StopSignal) -> None:
+        """Follow, step, send, tell, until stopped."""
+        self._adopt(self._reader.wait(stop, meanwhile=self._report))
+        self._epsilons = self._explore(self._lease.place)
+        while not stop.is_set():
+            self._follow()
+            self._tell(*self._collector.step(self._epsilons), stop)
+        self._reporter.now(self._metrics)
+
+    def run_in_lockstep(self, lockstep: Lockstep, stop: StopSignal) -> None:
+        """Collect once for the weights of each turn, until stopped."""
+        self._adopt(self._reader.wait(stop, meanwhile=self._report))
+        done = -1
+        while not stop.is_set():
+            turn = lockstep.turn(self._policy.learner_step)
+            if turn > done and self._policy.weights_version >= 0:
+                self._take_turn(turn, lockstep.transitions(turn), stop)
+                done = turn
+            self._sender.check()
+            self._adopt(self._reader.latest(_LISTEN_S))
+            self._report()
+        self._reporter.now(self._metrics)
+
+    def _take_turn(self, turn: int, transitions: int, stop: StopSignal) -> None:
+        collector = make_collector(self._config, self._worker, self._policy, turn)
+        collector.go_on_counting(self._collector)
+        self._collector, self._epsilons = collector, self._explore(WHOLE_LADDER)
+        for left in reversed(range(transitions // collector.num_robots)):
+            if stop.is_set():
+                return
+            self._tell(*collector.step(self._epsilons, breaks_off=not left), stop)
+
+    def _tell(
+        self, chunks: Sequence[Chunk], episodes: Sequence[EpisodeSummary], stop: StopSignal
+    ) -> None:
+        """Spool the chunks, publish the episodes."""
+        began_s = time.monotonic()
+        self._sender.put_all(chunks, stop, self._report_waiting)
+        self._waited_s += time.monotonic() - began_s
+        for episode in episodes:
+            self._episodes.put(encode(episode))
+        self._report()
+
+    def _report_waiting(self) -> None:
+        self._lease.follow()
+        self._reporter.worked(self._sender.heard_s)
+        self._reporter.maybe(self._metrics)
+
+    def _report(self) -> None:
+        self._lease.follow()
+        self._reporter.worked()
+        self._reporter.maybe(self._metrics)
+
+    def _follow(self) -> None:
+        """Adopt newer weights, and explore as their step and the place on the ladder say."""
+        adopted = self._adopt(self._reader.latest())
+        self._lease.follow()
+        if adopted or self._lease.place != self._place:
+            self._epsilons = self._explore(self._lease.place)
+
+    def _adopt(self, weights: Weights | None) -> bool:
+        """Act by these weights from now on, unless there are none or they are foreign."""
+        if weights is None:
+            return False
+        try:
+            self._policy.adopt(weights)
+        except CheckpointError as error:
+            self._refused += 1
+            _LOG.warning("weights %d refused: %s", weights.version, error)
+            return False
+        self._adopted_s = time.monotonic()
+        return True
+
+    def _explore(self, place: Place) -> Float32Array:
+        """Epsilon of each arena."""
+        self._place = place
+        return epsilons(
+            self._config.exploration,
+            self._policy.learner_step,
+            *place,
+            self._config.actor.num_arenas,
+        )
+
+    def _metrics(self) -> dict[str, float]:
+        collector, seconds = self._collector, self._collector.seconds
+        now = time.monotonic()
+        lived_s = max(now - self._started_s, 1e-9)
+        return {
+            "env_steps": collector.env_steps,
+            "robot_steps": collector.robot_steps,
+            "episodes": collector.num_episodes,
+            "chunks": self._sender.chunks,
+            "inserts_acknowledged": self._sender.transitions,
+            "spool_chunks": self._sender.spooled,
+            "weights_version": self._policy.weights_version,
+            "weights_age_s": now - self._adopted_s,
+            "weights_refused": self._reader.refused + self._refused,
+            "slot": self._lease.slot,
+            "epsilon_min": float(self._epsilons.min()),
+            "epsilon_max": float(self._epsilons.max()),
+            "inference_share": seconds.inference / lived_s,
+            "arena_share": seconds.arena / lived_s,
+            "draw_share": seconds.draw / lived_s,
+            "chunk_share": seconds.chunk / lived_s,
+            "wait_share": self._waited_s / lived_s,
+        }
+
+
+def make_collector(
+    config: Config, worker: str, policy: Policy, turn: int | None = None
+) -> Collector:
+    """Arenas, codec and chunkers for one actor; its seeds differ by its name.
+
+    turn: of a run that takes turns; they differ by it too, and the chunks are known again by it.
+    """
+    name_entropy = int.from_bytes(worker.encode(), "little")
+    entropy = [config.run.seed, name_entropy, *([] if turn is None else [turn])]
+    seeds = np.random.SeedSequence(entropy)
+    *arena_seeds, policy_seed = seeds.spawn(config.actor.num_arenas + 1)
+    arenas = make_arenas(
+        config.arena,
+        [np.random.default_rng(seed) for seed in arena_seeds],
+        [arena_identity(worker, index) for index in range(config.actor.num_arenas)],
+    )
+    origin = ChunkerConfig(
+        actor=worker,
+        incarnation=time.time_ns() if turn is None else turn,
+        gamma=config.agent.gamma,
+        n_step=config.agent.n_step,
+        stack=config.arena.stack,
+        chunk_length=config.actor.chunk_length,
+        prioritized=config.replay.prioritized,
+        reward_scale=config.agent.reward_scale,
+    )
+    codec = make_codec(config.arena)
+    return Collector(config, origin, arenas, codec, policy, np.random.default_rng(policy_seed))
+
+
+def arena_identity(worker: str, arena: int) -> int:
+    """What the images of a counting arena carry, in 16 bits: which of whose arenas it is."""
+    return (zlib.crc32(worker.encode()) + arena) % 2**16

@@ -1,0 +1,153 @@
+"""`mrcdrl evaluator`: join a run, judge its live weights again and again, keep the best."""
+
+import dataclasses
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mrcdrl.common.arena import Start, make_codec, test_starts
+from mrcdrl.common.config import Config
+from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.trajectory import Evaluation, Weights
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.model.policy import make_policy
+from mrcdrl.common.model.weights_files import read_weights, write_weights
+from mrcdrl.common.runtime.files import BEST_WEIGHTS
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.joining import Joining
+from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.sync.weights import WeightsReader
+from mrcdrl.common.transport import Session
+from mrcdrl.services.evaluator.score import evaluation
+from mrcdrl.services.evaluator.trial import PolicyPlayer, play
+
+_LOG = logging.getLogger("evaluator")
+_POLL_S = 0.2
+
+
+class Evaluator:
+    """The shell around a judge."""
+
+    def __init__(
+        self, config: Config, joining: Joining, session: Session, stop: StopSignal
+    ) -> None:
+        keys, worker = joining.keys, joining.worker
+        self._settings = config.evaluator
+        self._stop = stop
+        self._reader = WeightsReader(session, keys)
+        self._judge = Judge(config, worker)
+        self._best = Best(joining.run_dir / BEST_WEIGHTS)
+        self._publisher = session.publisher(keys.evaluation(worker))
+        self._reporter = StatsReporter(
+            session.publisher(keys.stats("evaluator", worker)), "evaluator", worker
+        )
+        self._evaluations = 0
+        self._version = -1
+        self._busy = False
+
+    def run(self) -> None:
+        """Judge, rest, take the newest weights, until stopped."""
+        weights = self._reader.wait(self._stop, meanwhile=self._report)
+        while weights is not None:
+            began_s = time.monotonic()
+            self._evaluate(weights)
+            spent_s = time.monotonic() - began_s
+            rest_s = max(self._settings.period_s, spent_s / self._settings.max_share)
+            weights = self._newest_after(began_s + rest_s)
+
+    def _evaluate(self, weights: Weights) -> None:
+        """Judge one version, publish the result, keep the weights if they are the best."""
+        self._version, self._busy = weights.version, True
+        try:
+            result = self._judge.judge(weights, self._go_on)
+        except CheckpointError as error:
+            _LOG.warning("weights %d refused: %s", weights.version, error)
+            result = None
+        self._busy = False
+        if result is not None:
+            self._evaluations += 1
+            self._publisher.put(encode(result))
+            self._best.offer(weights, result)
+
+    def _newest_after(self, until_s: float) -> Weights | None:
+        """The newest weights once the time has come and there are newer ones; None at the end."""
+        newest: Weights | None = None
+        while newest is None or time.monotonic() < until_s:
+            if not self._go_on():
+                return None
+            newest = self._reader.latest(_POLL_S) or newest
+        return newest
+
+    def _go_on(self) -> bool:
+        self._report()
+        return not self._stop.is_set()
+
+    def _report(self) -> None:
+        self._reporter.worked()
+        self._reporter.maybe(self._metrics)
+
+    def _metrics(self) -> dict[str, float]:
+        return {
+            "evaluations": self._evaluations,
+            "weights_version": self._version,
+            "busy": self._busy,
+        }
+
+
+class Judge:
+    """Runs the test on weights; the same starts each time."""
+
+    def __init__(self, config: Config, worker: str) -> None:
+        self._config = config
+        self._worker = worker
+        self._policy = make_policy(config)
+        self._starts: tuple[Start, ...] = test_starts(
+            config.arena, config.evaluator.episodes, config.evaluator.seed
+        )
+
+    def judge(self, weights: Weights, go_on: Callable[[], bool]) -> Evaluation | None:
+        """The evaluation; None where `go_on` said no."""
+        config, began_s = self._config, time.monotonic()
+        self._policy.adopt(weights)
+        player = PolicyPlayer(
+            config.arena,
+            make_codec(config.arena),
+            self._policy,
+            config.evaluator.epsilon,
+            np.random.default_rng(config.evaluator.seed),
+        )
+        results = play(config.arena, self._starts, player, go_on=lambda _done: go_on())
+        if results is None:
+            return None
+        return evaluation(
+            results,
+            worker=self._worker,
+            weights=weights,
+            num_robots=config.arena.num_robots,
+            seed=config.evaluator.seed,
+            wall_s=time.monotonic() - began_s,
+        )
+
+
+class Best:
+    """The weights judged best so far, kept beside the checkpoints."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def offer(self, weights: Weights, result: Evaluation) -> None:
+        """Keep the weights if they did better: more successes, or as many in less time."""
+        if (result.success_rate, -result.mean_frames) > self._rank():
+            write_weights(self._path, weights.payload, dataclasses.asdict(result))
+
+    def _rank(self) -> tuple[float, float]:
+        """Of the file, which another evaluator may have written since."""
+        try:
+            _, manifest = read_weights(self._path)
+        except CheckpointError:
+            manifest = {}
+        rate, frames = manifest.get("success_rate", -1), manifest.get("mean_frames", np.inf)
+        return (float(rate), -float(frames))

@@ -1,0 +1,27 @@
+"""`mrcdrl evaluator`: join a run and evaluate its live weights until told to stop."""
+
+import os
+from collections.abc import Sequence
+
+import torch
+
+from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.sync.joining import fetch_config, joining_arguments
+from mrcdrl.common.transport import Session
+from mrcdrl.services.evaluator.evaluator import Evaluator
+
+_NICE = 10  # judging gives way to learning where they share cores
+
+
+def main(argv: Sequence[str]) -> int:
+    """Judge for a run; the exit code."""
+    joining = joining_arguments("evaluator", argv)
+    stop = StopSignal().listen(STOP_DEADLINE_S)
+    with Session(joining.transport) as session:
+        config = fetch_config(session, joining, stop)
+        torch.set_num_threads(config.evaluator.threads)
+        evaluator = Evaluator(config, joining, session, stop)
+        session.announce(joining.keys.live("evaluator", joining.worker))
+        os.nice(_NICE)  # not sooner: whoever starts it again waits for it
+        evaluator.run()
+    return 0

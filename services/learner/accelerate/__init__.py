@@ -1,0 +1,1 @@
+"""What makes a learner step fast; `loss.py` is what it computes."""

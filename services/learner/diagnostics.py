@@ -1,0 +1,157 @@
+"""Signs that learning goes astray, told while it can still be mended.
+
+Invariants: looks only, and changes nothing; one inference on a few states and one transfer from
+the device for each look, so that a look a second costs next to nothing; a warning is logged once
+until its cause has gone; histograms have the same bins for as long as the run lasts.
+"""
+
+import logging
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mrcdrl.common.config import Config
+from mrcdrl.common.messages.trajectory import Float32Array
+from mrcdrl.common.model.q_network import Trace
+from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.learner.loss import Update
+
+_LOG = logging.getLogger("learner")
+_STATES = 64  # of a batch that are looked at
+_TOO_LARGE = 2.0  # times the largest return
+_TOO_DEAD = 0.9
+
+# Between the bins of a histogram, in largest returns
+_Q_EDGES = np.linspace(-1.0, 1.0, 9)
+_TD_ERROR_EDGES = 10.0 ** np.linspace(-4.0, 0.0, 9)
+_LOOKS_A_HISTOGRAM = 15
+
+
+class Diagnostics:
+    """Values, errors, units and target of a learner, as its last batch shows them."""
+
+    def __init__(self, config: Config, learner: Learner) -> None:
+        self._learner = learner
+        self._largest_return = largest_return(config)
+        self._warned: set[str] = set()
+        self._looks = 0
+        self._histograms = {
+            "q": Histogram(_Q_EDGES * self._largest_return),
+            "td_error": Histogram(_TD_ERROR_EDGES * self._largest_return),
+        }
+
+    def look(self, batch: Batch, update: Update) -> dict[str, float]:
+        """Metrics by name after a step on this batch; logs what is alarming.
+
+        Histograms are of the looks since the last ones, with the first and then each 15th.
+        """
+        values, dead = self._infer(batch.observation[:_STATES])
+        network = torch.stack([dead, self._drift()])
+        found = torch.cat([network, values.flatten(), update.numbers()]).cpu().numpy()
+        (dead_share, target_drift), q, told = np.split(found, [2, 2 + values.numel()])
+        (loss, mean_q, gradient_norm), errors = told[:3], np.abs(told[3:])
+        with np.errstate(invalid="ignore"):  # where there are infinite ones
+            q_min, q_p50, q_max = np.quantile(q, (0.0, 0.5, 1.0))
+            error_p50, error_p90, error_p99 = np.quantile(errors, (0.5, 0.9, 0.99))
+        self._warn(
+            "values",
+            max(-q_min, q_max) > _TOO_LARGE * self._largest_return,
+            f"values of {q_min:.3g} to {q_max:.3g}, where no return exceeds "
+            f"{self._largest_return:.3g}: learning diverges; lower agent.learning_rate",
+        )
+        self._warn(
+            "units",
+            dead_share > _TOO_DEAD,
+            f"{dead_share:.0%} of the network's units are 0 whatever they see: little can be "
+            "learned any more; lower agent.learning_rate and start anew",
+        )
+        return {
+            "loss": loss,
+            "mean_q": mean_q,
+            "td_error_mean": errors.mean(),
+            "gradient_norm": gradient_norm,
+            "loss_finite": math.isfinite(loss),
+            "q_min": q_min,
+            "q_p50": q_p50,
+            "q_max": q_max,
+            "td_error_p50": error_p50,
+            "td_error_p90": error_p90,
+            "td_error_p99": error_p99,
+            "dead_share": dead_share,
+            "target_drift": target_drift,
+            **self._binned(q=q, td_error=errors),
+        }
+
+    def _infer(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """Values [B, A], and the share of hidden units that are 0 for all these states.
+
+        Of a convolution the units are its channels.
+        """
+        network = self._learner.online
+        trace = Trace()
+        with torch.no_grad():
+            q = network.evaluate(network.prepare(states), network.operands(), trace)
+        dead = torch.cat([x.transpose(0, 1).flatten(1).amax(1) <= 0 for x in trace.units])
+        return q, dead.float().mean()
+
+    def _drift(self) -> Tensor:
+        """Distance of the online parameters from the target's, relative to the latter's length."""
+        online, target = self._learner.online.parameters(), self._learner.target.parameters()
+        with torch.no_grad():
+            pairs = [(p - t, t) for p, t in zip(online, target, strict=True)]
+            far = torch.nn.utils.get_total_norm([difference for difference, _ in pairs])
+            length = torch.nn.utils.get_total_norm([parameter for _, parameter in pairs])
+        return far / length
+
+    def _binned(self, **values: Float32Array) -> dict[str, float]:
+        """The histograms, where it is time for them."""
+        for name, histogram in self._histograms.items():
+            histogram.add(values[name])
+        self._looks += 1
+        if self._looks % _LOOKS_A_HISTOGRAM != 1:
+            return {}
+        return {
+            f"{name}_bin_{i}": share
+            for name, histogram in self._histograms.items()
+            for i, share in enumerate(histogram.take())
+        }
+
+    def _warn(self, cause: str, alarming: bool, text: str) -> None:
+        if alarming and cause not in self._warned:
+            _LOG.warning("%s", text)
+        (self._warned.add if alarming else self._warned.discard)(cause)
+
+
+class Histogram:
+    """Counts of values by bin: below the first edge, between edges, from the last one on."""
+
+    def __init__(self, edges: NDArray[np.float64]) -> None:
+        self._edges = edges
+        self._counts = np.zeros(len(edges) + 1)
+
+    def add(self, values: Float32Array) -> None:
+        """Values that are not numbers are left out."""
+        bins = np.searchsorted(self._edges, values[~np.isnan(values)], side="right")
+        self._counts += np.bincount(bins, minlength=len(self._counts))
+
+    def take(self) -> list[float]:
+        """The share of each bin in all since the last time; zeros where there were no values."""
+        shares = self._counts / max(self._counts.sum(), 1.0)
+        self._counts[:] = 0
+        return [float(share) for share in shares]
+
+
+def largest_return(config: Config) -> float:
+    """A bound of what any state is worth, in scaled rewards: all that an episode may bring."""
+    arena, gamma = config.arena, config.agent.gamma
+    steps = min(arena.max_frames, 1 / (1 - gamma))
+    rewards = (
+        abs(arena.success_reward)
+        + arena.max_collisions * abs(arena.collision_reward)
+        + steps * abs(arena.step_reward)
+    )
+    return config.agent.reward_scale * rewards

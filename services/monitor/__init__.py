@@ -1,0 +1,1 @@
+"""A run as its watchers know it: state, rates, bottleneck, records, screen."""

@@ -1,0 +1,95 @@
+"""What a run says of itself, folded into the state, the record and the stopping rule."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Stats
+from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys, role_and_worker
+from mrcdrl.services.monitor.recorder import Recorder
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.stopping import StoppingRule
+
+_LOG = logging.getLogger("train")
+M = TypeVar("M")
+
+
+class Follower:
+    """Subscribes to everything a run says of itself.
+
+    recorder: what writes it down; None where nothing does.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        keys: Keys,
+        state: RunState,
+        recorder: Recorder | None,
+        rule: StoppingRule,
+    ) -> None:
+        self._stats = session.queue_subscriber(keys.every_stats)
+        self._episodes = session.queue_subscriber(keys.every_episode)
+        self._evaluations = session.queue_subscriber(keys.every_evaluation)
+        self._presence = session.presence(keys.everyone())
+        self._state = state
+        self._recorder = recorder
+        self._rule = rule
+        self._lasted_s = state.resumed_at_s = recorder.restore(state, rule) if recorder else 0.0
+        self._started_s = time.monotonic()
+        self._record_due_s = 0.0
+
+    @property
+    def now(self) -> float:
+        """Seconds the run has lasted, over all resumptions."""
+        return self._lasted_s + self.lived_s
+
+    @property
+    def lived_s(self) -> float:
+        """Seconds since this start."""
+        return time.monotonic() - self._started_s
+
+    def listen(self, timeout_s: float) -> bool:
+        """Take in what has arrived, waiting up to `timeout_s` for something; whether any service
+        has told its figures."""
+        first = self._stats.take(timeout_s)
+        if first is not None:
+            self._take(Stats, first[1], lambda s: self._state.observe_stats(s, self.now))
+        for _, payload in self._stats.drain():
+            self._take(Stats, payload, lambda s: self._state.observe_stats(s, self.now))
+        for _, payload in self._episodes.drain():
+            self._take(EpisodeSummary, payload, self._observe_episode)
+        for _, payload in self._evaluations.drain():
+            self._take(Evaluation, payload, self._observe_evaluation)
+        for key, alive in self._presence.changes():
+            self._state.observe_presence(*role_and_worker(key), alive)
+        if self._recorder and self.lived_s >= self._record_due_s:
+            self._record_due_s = self.lived_s + 1.0
+            self._recorder.record_metrics(self._state, self.now)
+        return first is not None
+
+    def stop_reason(self) -> str | None:
+        """Why the run should end now; minutes count from this start."""
+        return self._rule.reason(self._state.learner_steps, self.lived_s / 60)
+
+    def _observe_episode(self, episode: EpisodeSummary) -> None:
+        self._state.observe_episode(episode)
+        self._rule.observe_episode(episode)
+        if self._recorder:
+            self._recorder.record_episode(episode, self._state, self.now)
+
+    def _observe_evaluation(self, evaluation: Evaluation) -> None:
+        record = self._state.observe_evaluation(evaluation, self.now)
+        self._rule.observe_evaluation(evaluation)
+        if self._recorder:
+            self._recorder.record_evaluation(record)
+
+    def _take(self, cls: type[M], payload: bytes, observe: Callable[[M], None]) -> None:
+        try:
+            observe(decode(cls, payload))
+        except WireError as error:
+            _LOG.warning("a %s refused: %s", cls.__name__, error)

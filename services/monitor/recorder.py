@@ -1,0 +1,211 @@
+"""Writes a run down as it goes: lines of JSON, TensorBoard events, a summary at the end.
+
+Invariants: a line is written whole or, after a crash, cut off by the next start; what is recorded
+is on its way to disk at most one `record_metrics` later; a resumed run appends.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mrcdrl.common.config import Config
+from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.messages.trajectory import EpisodeSummary
+from mrcdrl.common.runtime.closing import Closing
+from mrcdrl.common.runtime.files import atomic_write, reason
+from mrcdrl.services.monitor.records import (
+    EPISODES,
+    EVALUATIONS,
+    METRICS,
+    EpisodeRecord,
+    EvaluationRecord,
+    cut_torn_line,
+    episode_line,
+    evaluation_line,
+    read_episodes,
+    read_evaluations,
+    read_last_metrics,
+    to_line,
+)
+from mrcdrl.services.monitor.state import COUNTERS, RunState
+from mrcdrl.services.monitor.stopping import StoppingRule
+from mrcdrl.services.monitor.summary import summary_bytes
+
+SUMMARY = "summary.json"
+TENSORBOARD = "tensorboard"
+RATES = ("env_steps", "robot_steps", "learner_steps", "inserts", "samples")
+EVALUATION_FIELDS = (
+    "success_rate",
+    "collision_rate",
+    "timeout_rate",
+    "max_per_100",
+    "mean_per_100",
+    "variance_per_100",
+    "mean_frames",
+    "mean_score",
+)
+
+
+class Recorder(Closing):
+    """Owns the open files of one run's directory; close it, or use it in `with`."""
+
+    def __init__(self, run_dir: Path, config: Config) -> None:
+        """Raises RunDirectoryError when the directory cannot be written."""
+        self.run_dir = run_dir
+        self._config = config
+        try:
+            run_dir.mkdir(parents=True, exist_ok=True)
+            for name in (EPISODES, EVALUATIONS, METRICS):
+                cut_torn_line(run_dir / name)
+            self._episodes = (run_dir / EPISODES).open("a", encoding="utf-8")
+            self._evaluations = (run_dir / EVALUATIONS).open("a", encoding="utf-8")
+            self._metrics = (run_dir / METRICS).open("a", encoding="utf-8")
+        except OSError as error:
+            raise RunDirectoryError(f"{run_dir} cannot be written: {error}") from error
+        self._events = _open_events(run_dir / TENSORBOARD)
+
+    def __repr__(self) -> str:
+        return f"Recorder({str(self.run_dir)!r}, closed={self._metrics.closed})"
+
+    def restore(self, state: RunState, rule: StoppingRule) -> float:
+        """Folds what earlier processes of this run recorded; returns the seconds it lasted.
+
+        Raises RunDirectoryError when a file is of another version.
+        """
+        metrics = read_last_metrics(self.run_dir)
+        time_s = float(metrics.get("time_s", 0.0))
+        for episode in read_episodes(self.run_dir):
+            state.observe_episode(episode.episode)
+            rule.observe_episode(episode.episode)
+            time_s = max(time_s, episode.time_s)
+        for evaluation in read_evaluations(self.run_dir):
+            state.evaluations.append(evaluation)
+            rule.observe_evaluation(evaluation.evaluation)
+            time_s = max(time_s, evaluation.time_s)
+        state.restore_counted(
+            env_steps=metrics.get("env_steps", 0),
+            robot_steps=metrics.get("robot_steps", 0),
+            learner_steps=metrics.get("learner_steps", 0),
+            by_actor=_counted(metrics),
+        )
+        return time_s
+
+    def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
+        """Writes an episode that `state` has observed."""
+        line = episode_line(EpisodeRecord(now, state.learner_steps, episode))
+        with self._writing():
+            self._episodes.write(line)
+        self._event("training/score", episode.score, state.episodes)
+        self._event("training/mean_q", episode.mean_q, state.episodes)
+        if state.successes_per_100 is not None:
+            self._event("training/successes_per_100", state.successes_per_100, state.episodes)
+
+    def record_evaluation(self, record: EvaluationRecord) -> None:
+        """Writes what `state.observe_evaluation` returned."""
+        with self._writing():
+            self._evaluations.write(evaluation_line(record))
+            self._evaluations.flush()
+        for name in EVALUATION_FIELDS:
+            value = getattr(record.evaluation, name)
+            self._event(f"evaluation/{name}", value, record.evaluation.learner_step)
+
+    def record_metrics(self, state: RunState, now: float) -> None:
+        """Writes the figures of this second; call it once a second. Flushes all files."""
+        with self._writing():
+            self._metrics.write(to_line(flat_metrics(state, now)))
+        for name in RATES:
+            self._event(f"rates/{name}_per_s", state.per_second(name, now), int(now))
+        for service in state.alive("learner"):
+            for name, value in service.metrics.items():
+                self._event(f"learner/{name}", value, state.learner_steps)
+        self.flush()
+
+    def write_summary(self, state: RunState, now: float, stop_reason: str) -> Path:
+        """Writes summary.json in one move; returns its path."""
+        path = self.run_dir / SUMMARY
+        with self._writing():
+            atomic_write(path, summary_bytes(state, self._config, now, stop_reason))
+        return path
+
+    def flush(self) -> None:
+        """Hands what is buffered to the operating system."""
+        with self._writing():
+            for file in (self._episodes, self._evaluations, self._metrics):
+                file.flush()
+        if self._events is not None:
+            self._events.flush()
+
+    def close(self) -> None:
+        """Flushes and closes; a second call does nothing."""
+        for file in (self._episodes, self._evaluations, self._metrics):
+            with self._writing():
+                file.close()
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise RunDirectoryError(f"{self.run_dir} cannot be written: {reason(error)}") from error
+
+    def _event(self, tag: str, value: float, step: int) -> None:
+        if self._events is not None and math.isfinite(value):
+            self._events.add_scalar(tag, value, step)
+
+
+def _open_events(directory: Path) -> Any:
+    """A TensorBoard writer; None where the optional tensorboardX is not installed."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(directory), flush_secs=10, write_to_disk=True)
+
+
+def flat_metrics(state: RunState, now: float) -> dict[str, float | int | None]:
+    """The state as one flat object; each service's own metrics as role/id/name."""
+    successes = state.successes_per_100
+    flat: dict[str, float | int | None] = {
+        "time_s": round(now, 3),
+        "env_steps": state.env_steps,
+        "robot_steps": state.robot_steps,
+        "learner_steps": state.learner_steps,
+        "inserts": state.inserts,
+        "samples": state.samples,
+        "weights_version": state.weights_version,
+        "episodes": state.episodes,
+        "successes_per_100": successes,
+        "staleness_versions": state.max_staleness[0],
+        "staleness_s": state.max_staleness[1],
+    }
+    flat.update({f"{name}_per_s": round(state.per_second(name, now), 3) for name in RATES})
+    flat.update(_service_metrics(state))
+    return flat
+
+
+def _counted(metrics: Mapping[str, Any]) -> dict[tuple[str, str], float]:
+    """The counters of single actors in a line of metrics, by actor and counter."""
+    names = [name.split("/") for name in metrics if name.startswith("actor/")]
+    return {
+        (actor, name): float(metrics[f"actor/{actor}/{name}"])
+        for _, actor, name in names
+        if name in COUNTERS["actor"]
+    }
+
+
+def _service_metrics(state: RunState) -> Iterator[tuple[str, float]]:
+    for service in state.services:
+        if service.alive:
+            for name, value in service.metrics.items():
+                yield f"{service.role}/{service.id}/{name}", value
+    spreads = state.staleness_spreads
+    for actor in state.alive("actor"):
+        for unit, spread in spreads.get(actor.id, {}).items():
+            for name, value in asdict(spread).items():
+                yield f"actor/{actor.id}/staleness_{unit}_{name}", round(value, 3)

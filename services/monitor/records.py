@@ -1,0 +1,145 @@
+"""What a run leaves as lines of JSON: an episode, an evaluation, the metrics of a second.
+
+Invariants: one object a line; a number that is not finite is written as null and read as nan; a
+torn last line is what a crash leaves, and is no error.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
+
+Record = TypeVar("Record")
+
+EPISODES = "episodes.jsonl"
+EVALUATIONS = "evaluations.jsonl"
+METRICS = "metrics.jsonl"
+TAIL_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRecord:
+    """A finished training episode and when it was reported."""
+
+    time_s: float  # of the run, over all resumptions
+    learner_steps: int
+    episode: EpisodeSummary
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationRecord:
+    """An evaluation, when it was reported and how far collection was by then."""
+
+    time_s: float  # of the run, over all resumptions
+    env_steps: int
+    robot_steps: int
+    evaluation: Evaluation
+
+
+def to_line(values: Mapping[str, Any]) -> str:
+    """One line of strict JSON, newline included."""
+    return json.dumps({name: _finite(value) for name, value in values.items()}) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def episode_line(record: EpisodeRecord) -> str:
+    head = {"time_s": round(record.time_s, 3), "learner_steps": record.learner_steps}
+    return to_line({**head, **asdict(record.episode)})
+
+
+def evaluation_line(record: EvaluationRecord) -> str:
+    head = {
+        "time_s": round(record.time_s, 3),
+        "env_steps": record.env_steps,
+        "robot_steps": record.robot_steps,
+    }
+    return to_line({**head, **asdict(record.evaluation)})
+
+
+def _pick(values: Mapping[str, Any], noun: type) -> dict[str, Any]:
+    """The fields of `noun`, null read as nan; raises KeyError for one that is missing."""
+    names = [field.name for field in fields(noun)]
+    return {name: math.nan if values[name] is None else values[name] for name in names}
+
+
+def _episode(values: Mapping[str, Any]) -> EpisodeRecord:
+    picked = _pick(values, EpisodeSummary)
+    picked["outcome"] = Outcome(picked["outcome"])
+    return EpisodeRecord(values["time_s"], values["learner_steps"], EpisodeSummary(**picked))
+
+
+def _evaluation(values: Mapping[str, Any]) -> EvaluationRecord:
+    picked = _pick(values, Evaluation)
+    low, high = picked["success_interval"]
+    picked["success_interval"] = (low, high)
+    evaluation = Evaluation(**picked)
+    return EvaluationRecord(
+        values["time_s"], values["env_steps"], values["robot_steps"], evaluation
+    )
+
+
+def _objects(text: bytes) -> Iterator[dict[str, Any]]:
+    """The whole lines that are JSON objects; others (torn, zeroed by a crash) are left out."""
+    for line in text.split(b"\n")[:-1]:
+        try:
+            values = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(values, dict):
+            yield values
+
+
+def _read(path: Path, parse: Callable[[Mapping[str, Any]], Record]) -> list[Record]:
+    if not path.exists():
+        return []
+    try:
+        return [parse(values) for values in _objects(path.read_bytes())]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunDirectoryError(f"{path} is not of this version of mrcdrl: {error!r}") from error
+
+
+def read_episodes(run_dir: Path) -> list[EpisodeRecord]:
+    """Every episode of a run, in the order reported; [] when there is no file.
+
+    Raises RunDirectoryError when a line is whole but is no episode.
+    """
+    return _read(run_dir / EPISODES, _episode)
+
+
+def read_evaluations(run_dir: Path) -> list[EvaluationRecord]:
+    """Every evaluation of a run, in the order reported; [] when there is no file.
+
+    Raises RunDirectoryError when a line is whole but is no evaluation.
+    """
+    return _read(run_dir / EVALUATIONS, _evaluation)
+
+
+def read_last_metrics(run_dir: Path) -> dict[str, Any]:
+    """The last whole line of the metrics; {} when there is none."""
+    path = run_dir / METRICS
+    if not path.exists():
+        return {}
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        objects = list(_objects(file.read()))
+    return objects[-1] if objects else {}
+
+
+def cut_torn_line(path: Path) -> None:
+    """Shortens the file to its last newline, so that what is appended starts a line."""
+    if not path.exists():
+        return
+    with path.open("r+b") as file:
+        size = file.seek(0, 2)
+        start = max(0, size - TAIL_BYTES)
+        file.seek(start)
+        newline = file.read().rfind(b"\n")
+        file.truncate(start + newline + 1 if newline >= 0 else start)

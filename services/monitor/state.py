@@ -1,0 +1,307 @@
+"""What is known of a run: a fold of its messages into counters, rates, scores and who is there.
+
+Invariants: no clock, lock or transport inside; `now` is the seconds the run has lasted, over all
+its resumptions, and never falls; everything kept is bounded, except one byte an episode and one
+record an evaluation.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from mrcdrl.common.config import Config
+from mrcdrl.common.messages.trajectory import NO_SLOT, EpisodeSummary, Evaluation, Outcome, Stats
+from mrcdrl.services.monitor.rates import Rate, Share, Spread, Spreading
+from mrcdrl.services.monitor.records import EvaluationRecord
+
+ROLES = ("actor", "replay", "learner", "evaluator", "status")
+WITHOUT_FIGURES = ("status",)  # roles that are only there
+# Counters of an actor start at 0 with it; those of the others are kept with the run.
+COUNTERS = {
+    "actor": ("env_steps", "robot_steps"),
+    "replay": ("inserts", "samples"),
+    "learner": ("learner_steps",),
+}
+SHARES = {
+    "actor": ("inference_share", "arena_share", "draw_share", "wait_share"),
+    "replay": ("insert_held", "sample_held"),
+    "learner": ("data_wait_share", "decode_share", "step_share", "publish_share"),
+}
+STALENESS = ("versions", "s")
+HUNDRED = 100
+HISTORY_PERIOD = 10  # episodes between two points of the curve of successes
+LOG_LINES = 100
+
+
+@dataclass(slots=True)
+class Service:
+    """One process of the run, as last heard of."""
+
+    role: str
+    id: str
+    alive: bool = True
+    heard_s: float | None = None  # when its stats last came
+    metrics: dict[str, float] = field(default_factory=dict)
+    text: dict[str, str] = field(default_factory=dict)
+    rates: dict[str, Rate] = field(default_factory=dict)
+    shares: dict[str, Share] = field(default_factory=dict)
+    staleness: dict[str, Spreading] = field(default_factory=dict)  # of an actor, by unit
+
+    def per_second(self, name: str, now: float) -> float:
+        """Rate of one of its counters; 0 for what it does not count."""
+        rate = self.rates.get(name)
+        return rate.per_second(now) if rate else 0.0
+
+    def share(self, name: str) -> float:
+        """Mean of one of its shares (0 ... 1) over the window."""
+        share = self.shares.get(name)
+        return share.mean if share else 0.0
+
+    @property
+    def slot(self) -> int | None:
+        """The slot of exploration that is leased to it; None for none, or when it has gone."""
+        slot = int(self.metrics.get("slot", NO_SLOT))
+        return slot if self.alive and slot != NO_SLOT else None
+
+    def silent_s(self, now: float) -> float:
+        """Seconds since its last stats; infinite before the first."""
+        return math.inf if self.heard_s is None else max(0.0, now - self.heard_s)
+
+
+class RunState:
+    """The run as the dashboard knows it; `observe_*` folds in a message, the rest reads."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.resumed_at_s = 0.0  # seconds the run had lasted when it was taken up again
+        self.log: deque[str] = deque(maxlen=LOG_LINES)
+        self.evaluations: list[EvaluationRecord] = []
+        self.episodes = 0
+        self.max_successes = 0  # of 100 consecutive episodes
+        self.success_history: list[int] = []  # successes_per_100, every HISTORY_PERIOD episodes
+        self.recent_scores: deque[float] = deque(maxlen=HUNDRED)
+        self.recent_q: deque[float] = deque(maxlen=HUNDRED)
+        self._outcomes = bytearray()
+        self._services: dict[tuple[str, str], Service] = {}
+        self._collected = {"env_steps": 0.0, "robot_steps": 0.0}
+        self._counted: dict[tuple[str, str], float] = {}  # by who kept the record before
+        self._learner_steps_before = 0  # until the learner of this start is heard of
+
+    def __repr__(self) -> str:
+        return (
+            f"RunState(services={len(self._services)}, episodes={self.episodes}, "
+            f"successes={self.successes_per_100}, robot_steps={self.robot_steps}, "
+            f"learner_steps={self.learner_steps})"
+        )
+
+    # -- what happens ------------------------------------------------------------------
+
+    def observe_stats(self, stats: Stats, now: float) -> None:
+        """Takes a service's figures; a fallen counter or a new `incarnation` is a restart."""
+        service = self._service(stats.role, stats.id)
+        before = service.text.get("incarnation")
+        restarted = before is not None and before != stats.text.get("incarnation", before)
+        service.alive, service.heard_s = True, now
+        service.metrics, service.text = dict(stats.metrics), dict(stats.text)
+        for name in COUNTERS.get(stats.role, ()):
+            if name in stats.metrics:
+                earlier = self._counted.get((stats.id, name), 0.0)  # of actors only
+                rate = service.rates.setdefault(name, Rate(stats.role != "actor", earlier))
+                counted = rate.observe(stats.metrics[name], now, restarted)
+                if name in self._collected:
+                    self._collected[name] += counted
+        for name in SHARES.get(stats.role, ()):
+            if name in stats.metrics:
+                service.shares.setdefault(name, Share()).observe(stats.metrics[name], now)
+        stale = self.staleness(service) if stats.role == "actor" else None
+        for unit, value in zip(STALENESS, stale or (), strict=False):
+            service.staleness.setdefault(unit, Spreading()).observe(value, now)
+
+    def observe_episode(self, episode: EpisodeSummary) -> None:
+        self.episodes += 1
+        self._outcomes.append(episode.outcome is Outcome.SUCCESS)
+        self.recent_scores.append(episode.score)
+        self.recent_q.append(episode.mean_q)
+        successes = self.successes_per_100
+        if successes is not None:
+            self.max_successes = max(self.max_successes, successes)
+            if self.episodes % HISTORY_PERIOD == 0:
+                self.success_history.append(successes)
+
+    def observe_evaluation(self, evaluation: Evaluation, now: float) -> EvaluationRecord:
+        """Takes an evaluation; returns it with how far collection was."""
+        record = EvaluationRecord(now, self.env_steps, self.robot_steps, evaluation)
+        self.evaluations.append(record)
+        return record
+
+    def observe_presence(self, role: str, service_id: str, alive: bool) -> None:
+        """A service's liveliness token came or went."""
+        self._service(role, service_id).alive = alive
+
+    def observe_log(self, line: str) -> None:
+        """A warning for the screen."""
+        self.log.append(line)
+
+    def restore_counted(
+        self,
+        env_steps: float,
+        robot_steps: float,
+        learner_steps: float,
+        by_actor: Mapping[tuple[str, str], float] = MappingProxyType({}),
+    ) -> None:
+        """Adds what the run's actors collected before; the learner counts on by itself.
+
+        by_actor: what is in these of actors that may be there still, by actor and counter.
+        """
+        self._counted.update(by_actor)
+        self._collected["env_steps"] += env_steps
+        self._collected["robot_steps"] += robot_steps
+        self._learner_steps_before = int(learner_steps)
+
+    def _service(self, role: str, service_id: str) -> Service:
+        return self._services.setdefault((role, service_id), Service(role, service_id))
+
+    # -- who is there -------------------------------------------------------------------
+
+    @property
+    def services(self) -> list[Service]:
+        """Every service ever heard of, along the ring, then by id."""
+        order = {role: index for index, role in enumerate(ROLES)}
+        return sorted(
+            self._services.values(), key=lambda s: (order.get(s.role, len(order)), s.role, s.id)
+        )
+
+    def alive(self, role: str) -> list[Service]:
+        """The services of a role that are there, by id."""
+        return [s for s in self.services if s.role == role and s.alive]
+
+    def gauges(self, role: str, name: str) -> list[float]:
+        """A metric of every service of a role that is there and reports it."""
+        return [s.metrics[name] for s in self.alive(role) if name in s.metrics]
+
+    def _known(self, role: str, name: str) -> float:
+        """Sum of a metric over a role's services that are there, else the last one heard of."""
+        heard = [s for s in self._services.values() if s.role == role and name in s.metrics]
+        there = [s for s in heard if s.alive] or sorted(heard, key=lambda s: s.heard_s or 0.0)[-1:]
+        return sum(s.metrics[name] for s in there)
+
+    # -- counters and rates ---------------------------------------------------------------
+
+    @property
+    def env_steps(self) -> int:
+        return int(self._collected["env_steps"])
+
+    @property
+    def robot_steps(self) -> int:
+        return int(self._collected["robot_steps"])
+
+    @property
+    def learner_steps(self) -> int:
+        return int(self._known("learner", "learner_steps")) or self._learner_steps_before
+
+    @property
+    def weights_version(self) -> int:
+        return int(self._known("learner", "weights_version"))
+
+    @property
+    def inserts(self) -> int:
+        return int(self._known("replay", "inserts"))
+
+    @property
+    def samples(self) -> int:
+        return int(self._known("replay", "samples"))
+
+    def per_second(self, name: str, now: float) -> float:
+        """Rate of a counter over the last seconds, summed over all that count it: env_steps,
+        robot_steps, inserts, samples, learner_steps."""
+        return sum(service.per_second(name, now) for service in self._services.values())
+
+    def share(self, role: str, name: str) -> float:
+        """Mean of a share (0 ... 1) over the role's services that are there."""
+        services = self.alive(role)
+        return sum(s.share(name) for s in services) / max(1, len(services))
+
+    def staleness(self, actor: Service) -> tuple[int, float] | None:
+        """An actor's weights: versions behind the learner's, and seconds since it adopted them."""
+        learner = self.gauges("learner", "weights_version")
+        if not learner or "weights_version" not in actor.metrics:
+            return None
+        behind = max(0, int(max(learner) - actor.metrics["weights_version"]))
+        return behind, actor.metrics.get("weights_age_s", 0.0)
+
+    @property
+    def max_staleness(self) -> tuple[int, float]:
+        """The worst of all actors, in versions and in seconds, each by itself."""
+        known = [s for s in map(self.staleness, self.alive("actor")) if s is not None]
+        return max((b for b, _ in known), default=0), max((a for _, a in known), default=0.0)
+
+    @property
+    def staleness_spreads(self) -> dict[str, dict[str, Spread]]:
+        """Of each actor ever heard of, by unit: over its reports of the last ten minutes."""
+        return {
+            s.id: {unit: spread for unit, each in s.staleness.items() if (spread := each.spread)}
+            for s in self.services
+            if s.staleness
+        }
+
+    # -- replay and exploration -----------------------------------------------------------
+
+    @property
+    def replay_size(self) -> int:
+        return int(sum(self.gauges("replay", "size")))
+
+    @property
+    def replay_capacity(self) -> int:
+        return int(sum(self.gauges("replay", "capacity"))) or self.config.replay.capacity
+
+    @property
+    def samples_per_insert(self) -> float | None:
+        """Transitions sampled for each inserted, as replay counts them; None before it does."""
+        reported = self.gauges("replay", "samples_per_insert")
+        return sum(reported) / len(reported) if reported else None
+
+    @property
+    def epsilons(self) -> tuple[float, float] | None:
+        """Least and greatest epsilon of all actors."""
+        low, high = self.gauges("actor", "epsilon_min"), self.gauges("actor", "epsilon_max")
+        return (min(low), max(high)) if low and high else None
+
+    # -- scores ---------------------------------------------------------------------------
+
+    @property
+    def successes_per_100(self) -> int | None:
+        """Successes of the last 100 episodes; None before there are as many."""
+        return sum(self._outcomes[-HUNDRED:]) if len(self._outcomes) >= HUNDRED else None
+
+    @property
+    def recent_successes(self) -> tuple[int, int]:
+        """Successes, and of how many: the last 100 episodes, or all while they are fewer."""
+        latest = self._outcomes[-HUNDRED:]
+        return sum(latest), len(latest)
+
+    @property
+    def hundreds(self) -> list[int]:
+        """Successes of the first, second, ... 100 episodes (Table 1, Fig. 6b)."""
+        whole = len(self._outcomes) // HUNDRED * HUNDRED
+        return [sum(self._outcomes[i : i + HUNDRED]) for i in range(0, whole, HUNDRED)]
+
+    @property
+    def last_evaluation(self) -> EvaluationRecord | None:
+        return self.evaluations[-1] if self.evaluations else None
+
+    @property
+    def best_evaluation(self) -> EvaluationRecord | None:
+        """Of the highest success rate; of equal ones the first."""
+        return max(self.evaluations, key=lambda r: r.evaluation.success_rate, default=None)
+
+    def time_left_s(self, now: float) -> float | None:
+        """Until `run.minutes` or, at the present rate, `run.learner_steps`; None: no end known."""
+        run, ends = self.config.run, []
+        if run.minutes:
+            ends.append(max(0.0, 60 * run.minutes - (now - self.resumed_at_s)))
+        rate = self.per_second("learner_steps", now)
+        if run.learner_steps and rate > 0:
+            ends.append(max(0.0, (run.learner_steps - self.learner_steps) / rate))
+        return min(ends, default=None)

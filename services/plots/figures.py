@@ -1,0 +1,266 @@
+"""A finished or running run as images: its training curve, and paths driven in the arena.
+
+Invariants: drawn with matplotlib's Figure on Agg, no global state; an empty run gives an empty
+but labelled image.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from matplotlib.ticker import MaxNLocator
+
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.trajectory import Float64Array, Outcome
+from mrcdrl.common.runtime.files import reason
+from mrcdrl.services.monitor.records import (
+    EpisodeRecord,
+    EvaluationRecord,
+    read_episodes,
+    read_evaluations,
+)
+
+HUNDRED = 100
+DPI = 130
+LIGHT_BLUE, DARK_BLUE, GREEN = "#a9cbe8", "#123c73", "#2a7f3f"
+# One hue a robot: from the light of the start to the dark of the end.
+ROBOT_HUES = (
+    ("#cfe3f5", "#0b3c73"),
+    ("#fbdcc0", "#9c3d04"),
+    ("#d3ecd0", "#0d5a24"),
+    ("#e2d8ee", "#4a1a82"),
+    ("#f7d0dc", "#8c1044"),
+    ("#d2eeee", "#075a5f"),
+    ("#f3e8bd", "#756003"),
+    ("#dddddd", "#222222"),
+    ("#e9d8cc", "#5b3218"),
+    ("#dcecb5", "#4a6408"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Path2D:
+    """One episode's paths, as `trajectories` draws them."""
+
+    robots: Float64Array  # [T, K, 3], x_px, y_px, heading_rad
+    targets: Float64Array  # [M, 2], centres in px
+    obstacles: Float64Array  # [O, 3], centres and radius in px
+    outcome: Outcome
+
+
+def training_curve(run_dir: Path, out: Path) -> None:
+    """The run's curve as a PNG at `out` (paper Fig. 6, and the test while it trains).
+
+    (a) mean score of episodes; (b) successes per 100 episodes with their running maxima; (c)
+    evaluation success with its 95 % interval. Raises RunDirectoryError for a foreign file.
+    """
+    episodes, tests = read_episodes(run_dir), read_evaluations(run_dir)
+    figure = Figure(figsize=(9, 11), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    score, successes, evaluation = figure.subplots(3, 1)
+    group = 10 * HUNDRED if len(episodes) >= 40 * HUNDRED else HUNDRED
+    _draw_scores(score, episodes, group)
+    _draw_successes(successes, episodes, group)
+    _draw_evaluations(evaluation, tests)
+    figure.suptitle(run_dir.name, fontsize=13, fontweight="bold")
+    save(figure, out)
+
+
+def _draw_scores(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -> None:
+    scores = np.array([record.episode.score for record in episodes])
+    dress(axes, "(a) score of an episode, mean over its robots", "episodes", "score")
+    if not episodes:
+        say(axes, "no episode")
+    else:
+        each = max(1, min(HUNDRED, len(scores) // 20))
+        label = f"mean of {each} episodes" if each > 1 else "each episode"
+        axes.plot(*means(scores, each), color=LIGHT_BLUE, lw=1.2, label=label)
+        if len(scores) >= 2 * group:
+            label = f"mean of {group} episodes"
+            axes.plot(*means(scores, group), color=DARK_BLUE, lw=2, label=label)
+        axes.legend(loc="lower right", frameon=False)
+    _over_episodes(axes, episodes)
+
+
+def _draw_successes(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -> None:
+    won = np.array([record.episode.outcome is Outcome.SUCCESS for record in episodes], float)
+    dress(axes, "(b) successes per 100 episodes", "episodes", "successes")
+    axes.set_ylim(-2, 112)
+    if len(won) < HUNDRED:
+        say(axes, f"{int(won.sum())} successes in {len(won)} episodes, fewer than 100")
+    else:
+        counted, values = means(HUNDRED * won, HUNDRED)
+        if group > HUNDRED:
+            axes.plot(counted, values, color=LIGHT_BLUE, lw=1.2, label="each 100 episodes")
+            label = f"mean of {group} episodes"
+            axes.plot(*means(HUNDRED * won, group), color=DARK_BLUE, lw=2, label=label)
+        else:
+            sliding = np.convolve(won, np.ones(HUNDRED), "valid")
+            middles = np.arange(len(sliding)) + (HUNDRED + 1) / 2
+            axes.plot(middles, sliding, color=LIGHT_BLUE, lw=1.2, label="any 100 in a row")
+            axes.plot(counted, values, color=DARK_BLUE, lw=2, label="each 100 episodes")
+        before = np.concatenate(([-1.0], np.maximum.accumulate(values)[:-1]))
+        rises = values > before
+        axes.scatter(
+            counted[rises], values[rises], s=26, c=np.flatnonzero(rises), cmap="plasma",
+            edgecolor="black", lw=0.5, zorder=3, label="new maximum",
+        )  # fmt: skip
+        best = int(np.argmax(values))
+        axes.annotate(
+            f"{values[best]:.0f}", (counted[best], values[best]), (0, 6),
+            textcoords="offset points", ha="center", fontweight="bold",
+        )  # fmt: skip
+        axes.legend(loc="lower right", frameon=False)
+    _over_episodes(axes, episodes)
+
+
+def _over_episodes(axes: Axes, episodes: Sequence[EpisodeRecord]) -> None:
+    axes.set_xlim(0, 1.04 * max(10, len(episodes)))
+    _minutes(axes, np.arange(1, len(episodes) + 1), [record.time_s for record in episodes])
+
+
+def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
+    title = "(c) success in the paper's test: one collision fails"
+    dress(axes, title, "learner steps", "success, %")
+    axes.set_ylim(-2, 112)
+    tests = sorted(tests, key=lambda record: record.evaluation.learner_step)
+    steps = np.array([record.evaluation.learner_step for record in tests], float)
+    if not tests:
+        say(axes, "no evaluation")
+    else:
+        rates = 100 * np.array([record.evaluation.success_rate for record in tests])
+        bounds = 100 * np.array([record.evaluation.success_interval for record in tests])
+        low, high = bounds.T
+        axes.fill_between(steps, low, high, color=GREEN, alpha=0.18, lw=0, label="95 % interval")
+        axes.vlines(steps, low, high, color=GREEN, alpha=0.4, lw=0.8)
+        starts = tests[-1].evaluation.episodes
+        label = f"{starts} starts each"
+        axes.plot(steps, rates, color=GREEN, lw=1.8, marker="o", ms=4, label=label)
+        best = int(np.argmax(rates))
+        axes.annotate(
+            f"{rates[best]:.1f} %", (steps[best], rates[best]), (0, 7),
+            textcoords="offset points", ha="center", fontweight="bold",
+        )  # fmt: skip
+        axes.legend(loc="lower right", frameon=False)
+    last = max(10.0, steps.max(initial=0))
+    axes.set_xlim(-0.02 * last, 1.04 * last)
+    _minutes(axes, steps, [record.time_s for record in tests])
+
+
+def means(values: Float64Array, group: int) -> tuple[Float64Array, Float64Array]:
+    """Episode in the middle of each whole group, and the group's mean."""
+    whole = len(values) // group
+    middles: Float64Array = group * (np.arange(whole, dtype=np.float64) + 0.5) + 0.5
+    return middles, values[: whole * group].reshape(whole, group).mean(axis=1)
+
+
+def say(axes: Axes, words: str) -> None:
+    axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", color="#777777")
+
+
+def dress(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(color="#e4e4e4", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}".replace(",", " "))
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+
+
+def _minutes(axes: Axes, positions: Any, times_s: Sequence[float]) -> None:
+    """A second axis at the top: the minutes at which the positions were reached."""
+    if len(times_s) < 2 or times_s[-1] <= times_s[0] or positions[-1] <= positions[0]:
+        return
+    minutes = np.maximum.accumulate(np.asarray(times_s)) / 60
+    slope = np.linspace(0, 1e-6, len(minutes))  # inverted below, so it has to rise
+    to_minutes = _interpolation(np.asarray(positions, float) + slope, minutes + slope)
+    to_position = _interpolation(minutes + slope, np.asarray(positions, float) + slope)
+    top = axes.secondary_xaxis("top", functions=(to_minutes, to_position))
+    top.set_xlabel("minutes", fontsize=9)
+    top.tick_params(labelsize=8)
+    top.xaxis.set_major_locator(MaxNLocator(8))
+
+
+def _interpolation(x: Float64Array, y: Float64Array) -> Callable[[Any], Any]:
+    """Linear between the points, and beyond them with their mean slope."""
+    slope = (y[-1] - y[0]) / (x[-1] - x[0])
+
+    def at(value: Any) -> Any:
+        value = np.asarray(value, float)
+        inside = np.interp(value, x, y)
+        return inside + slope * (np.minimum(0, value - x[0]) + np.maximum(0, value - x[-1]))
+
+    return at
+
+
+def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> None:
+    """A grid of episodes as an image at `out` (paper Fig. 8).
+
+    Each robot's path is shaded from light (start) to dark (end) in its own hue; red circles:
+    starts; blue squares: targets; red lines: walls; green discs: obstacles.
+    """
+    columns = min(4, max(1, len(episodes)))
+    rows = max(1, -(-len(episodes) // columns))
+    figure = Figure(figsize=(3.1 * columns, 3.35 * rows), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for axes, episode in zip(grid.flat, episodes, strict=False):
+        draw_paths(axes, episode, config)
+    save(figure, out)
+
+
+def save(figure: Figure, out: Path) -> None:
+    """Writes it in the format that the name's suffix says; raises MrcdrlError where it cannot."""
+    try:
+        figure.savefig(out)
+    except OSError as error:
+        raise MrcdrlError(f"figure {out} cannot be written: {reason(error)}") from error
+
+
+def draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
+    _draw_arena(axes, episode, config)
+    radius = config.robot_radius_px
+    for k in range(episode.robots.shape[1]):
+        path = episode.robots[:, k, :2]
+        light, dark = ROBOT_HUES[k % len(ROBOT_HUES)]
+        shades = LinearSegmentedColormap.from_list(f"robot {k}", [light, dark])
+        pieces = np.stack([path[:-1], path[1:]], axis=1)
+        lines = LineCollection(list(pieces), cmap=shades, lw=3, capstyle="round", zorder=2)
+        lines.set_array(np.arange(len(pieces)))
+        axes.add_collection(lines)
+        axes.add_patch(Circle(path[0], radius, fill=False, ec="red", lw=1.6, zorder=3))
+        axes.add_patch(Circle(path[-1], radius, fc=dark, ec=dark, alpha=0.35, lw=1.6, zorder=3))
+        heading = episode.robots[-1, k, 2]
+        tip = path[-1] + radius * np.array([np.cos(heading), np.sin(heading)])
+        axes.plot(*np.stack([path[-1], tip]).T, color=dark, lw=1.6, zorder=4)
+    axes.set_title(f"{episode.outcome.value}, {len(episode.robots) - 1} frames", fontsize=9)
+
+
+def _draw_arena(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
+    size, side = config.size_px, config.target_size_px
+    middle = config.wall_offset_px + config.wall_thickness_px / 2
+    inside = size - 2 * middle
+    axes.add_patch(Rectangle((0, 0), size, size, fc="#fafafa", ec="#888888", lw=0.8))
+    axes.add_patch(Rectangle((middle, middle), inside, inside, fill=False, ec="#d03030", lw=1.3))
+    for x0, y0, x1, y1 in config.inner_walls_px:
+        axes.plot([x0, x1], [y0, y1], color="#d03030", lw=1.3)
+    for x, y, radius in episode.obstacles:
+        axes.add_patch(Circle((x, y), radius, fc="#30a030", zorder=1))
+    for x, y in episode.targets:
+        axes.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, fc="#2050d0", zorder=1))
+    axes.set_xlim(-5, size + 5)
+    axes.set_ylim(size + 5, -5)  # y points down, as in the arena's image
+    axes.set_aspect("equal")

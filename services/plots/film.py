@@ -1,0 +1,177 @@
+"""Films of episodes: the arena, what each robot sees of it, a line of words.
+
+Invariants: frames are uint8 BGR of one size; a film is H.264 that every player shows, or a GIF
+that every page shows: half as wide and high, every third frame. Neither is held in memory.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from typing import Literal
+
+import av
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.trajectory import UInt8Array
+
+BACKGROUND = 24
+CAPTION_PX, LABEL_PX, GAP_PX = 40, 22, 12
+MAX_PANEL_PX = 560  # width for the robots' views
+FONT = "fonts/ttf/DejaVuSans.ttf"
+
+
+def write_film(path: Path, frames: Iterable[UInt8Array], fps: int) -> int:
+    """Writes the frames (uint8 BGR [H, W, 3], all of one size); returns how many it has got.
+
+    The suffix chooses: .mp4 or .gif. An odd height or width loses its last row or column. Raises
+    MrcdrlError for another suffix, when there is no frame, when sizes differ, or when the file or
+    the encoder fails.
+    """
+    check_suffix(path)
+    form = _FORMS[path.suffix]
+    num_frames = 0
+    shape: tuple[int, ...] | None = None
+    try:
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream(form.codec, rate=Fraction(fps, form.every))
+            stream.pix_fmt = form.pixels
+            stream.options = form.options
+            for frame in islice(frames, 0, None, form.every):
+                height, width = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
+                image = form.image(np.ascontiguousarray(frame[:height, :width]))
+                if shape is None:
+                    shape = frame.shape
+                    stream.height, stream.width = image.height, image.width
+                if frame.shape != shape:
+                    raise MrcdrlError(f"film {path}: a frame is {frame.shape}, the first {shape}")
+                container.mux(stream.encode(image))
+                num_frames += 1
+            if num_frames:
+                container.mux(stream.encode())
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        raise MrcdrlError(f"film {path} cannot be written: {error}") from error
+    if not num_frames:
+        path.unlink(missing_ok=True)
+        raise MrcdrlError(f"film {path} has no frame")
+    return num_frames
+
+
+def check_suffix(path: Path) -> None:
+    """Raises MrcdrlError unless films of that name can be written."""
+    if path.suffix not in _FORMS:
+        raise MrcdrlError(f"film {path}: the name ends in none of {', '.join(_FORMS)}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """How a kind of film is encoded."""
+
+    codec: Literal["libx264", "gif"]
+    pixels: str  # format of the encoder's images
+    options: dict[str, object]
+    every: int  # one frame of so many is kept
+    image: Callable[[UInt8Array], av.VideoFrame]  # of a frame of even size
+
+
+def _whole(frame: UInt8Array) -> av.VideoFrame:
+    return av.VideoFrame.from_ndarray(frame, format="bgr24")
+
+
+def _small(frame: UInt8Array) -> av.VideoFrame:
+    """Half the size, in the palette's colours."""
+    half = Image.fromarray(frame[..., ::-1]).reduce(2)
+    indices = half.quantize(palette=_palette(), dither=Image.Dither.NONE)
+    argb = np.insert(_colours(), 0, 255, axis=1)
+    return av.VideoFrame.from_ndarray((np.asarray(indices), argb), format="pal8")  # type: ignore[arg-type]
+
+
+@cache
+def _colours() -> UInt8Array:
+    """The film's: intensities, and red and blue on black and on white; RGB [256, 3]."""
+    intensities = np.linspace((0, 0, 0), (255, 255, 255), 128)
+    ramps = [
+        np.linspace(paint, ground, 32)
+        for paint in ((255, 0, 0), (0, 0, 255))
+        for ground in ((0, 0, 0), (255, 255, 255))
+    ]
+    return np.concatenate([intensities, *ramps]).astype(np.uint8)
+
+
+@cache
+def _palette() -> Image.Image:
+    image = Image.new("P", (1, 1))
+    image.putpalette(_colours().tobytes())
+    return image
+
+
+_FORMS = {
+    ".mp4": _Form("libx264", "yuv420p", {"crf": "20"}, 1, _whole),
+    ".gif": _Form("gif", "pal8", {}, 3, _small),
+}
+
+
+def compose_frame(arena_bgr: UInt8Array, views: UInt8Array, caption: str) -> UInt8Array:
+    """One frame: the arena at left, the robots' views enlarged at right, the caption below.
+
+    arena_bgr: uint8 [S, S, 3]. views: uint8 [K, V, V], grey. Returns uint8 BGR [H, W, 3] of
+    even size, the same for the same shapes.
+    """
+    size = arena_bgr.shape[0]
+    panel = _panel(views, size)
+    height, width = size + CAPTION_PX, arena_bgr.shape[1] + panel.shape[1]
+    frame = np.full((height + height % 2, width + width % 2, 3), BACKGROUND, np.uint8)
+    frame[:size, : arena_bgr.shape[1]] = arena_bgr
+    frame[:size, arena_bgr.shape[1] : width] = panel
+    frame[size : size + CAPTION_PX, :width] = _text(caption, width, CAPTION_PX, 18)
+    return frame
+
+
+def _panel(views: UInt8Array, height: int) -> UInt8Array:
+    """The views, as large as whole factors allow, in a grid with a label above each."""
+    num, side = views.shape[:2]
+    columns, scale = _grid(num, side, height)
+    large = side * scale
+    panel = np.full((height, GAP_PX + columns * (large + GAP_PX), 3), BACKGROUND, np.uint8)
+    rows = -(-num // columns)
+    pitch = LABEL_PX + large + GAP_PX
+    top = max(0, (height - rows * pitch + GAP_PX) // 2)
+    for k, view in enumerate(views):
+        y = top + k // columns * pitch
+        x = GAP_PX + k % columns * (large + GAP_PX)
+        panel[y : y + LABEL_PX, x : x + large] = _text(f"robot {k + 1} sees", large, LABEL_PX, 13)
+        enlarged = view.repeat(scale, axis=0).repeat(scale, axis=1)[:, :, None]
+        room = panel[y + LABEL_PX : y + LABEL_PX + large, x : x + large]
+        room[:] = enlarged[: room.shape[0]]
+    return panel
+
+
+def _grid(num: int, side: int, height: int) -> tuple[int, int]:
+    """Columns and whole factor with which the views are largest."""
+
+    def scale(columns: int) -> int:
+        rows = -(-num // columns)
+        down = (height - (rows - 1) * GAP_PX) // rows - LABEL_PX
+        across = (MAX_PANEL_PX - GAP_PX) // columns - GAP_PX
+        return min(down // side, across // side)
+
+    columns = max(range(1, max(2, num + 1)), key=scale)
+    return columns, max(1, scale(columns))
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / FONT), size)
+
+
+def _text(text: str, width: int, height: int, size: int) -> UInt8Array:
+    """Light words on the background, vertically centred; uint8 [height, width, 3]."""
+    image = Image.new("L", (width, height), BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    draw.text((GAP_PX // 2, height // 2), text, fill=235, font=_font(size), anchor="lm")
+    return np.repeat(np.asarray(image, dtype=np.uint8)[:, :, None], 3, axis=2)

@@ -1,0 +1,155 @@
+"""The paper's images of any arena and run: Figs. 1, 3, 7 and 10 (Figs. 6 and 8: `figures`).
+
+Invariants: drawn with matplotlib's Figure on Agg, no global state.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.trajectory import Evaluation, Float64Array, Outcome, UInt8Array
+from mrcdrl.services.monitor.records import read_episodes, read_evaluations
+from mrcdrl.services.plots.figures import DPI, HUNDRED, Path2D, draw_paths, dress, means, save, say
+
+SUFFIXES = (".png", ".svg")
+_COLOURS = ("#123c73", "#c4500a", "#2a7f3f", "#6a3d9a", "#b01050", "#0a7a80", "#8a7400", "#444444")
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What one robot sees of an arena, and where that lies in it."""
+
+    grey: UInt8Array  # [S, S], the whole arena
+    pose: Float64Array  # [3], x px, y px, heading rad, of the robot
+    view: UInt8Array  # [V, V], its image
+    states: UInt8Array  # [K, S, V, V], of all robots, oldest image first
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """One row of a comparison."""
+
+    name: str
+    episodes: Sequence[Path2D]  # from the same starts in every row
+
+
+def arenas(images: Sequence[UInt8Array], titles: Sequence[str], out: Path) -> None:
+    """Arenas side by side (Fig. 1); images: BGR [S, S, 3]."""
+    figure, panels = _panels(1, len(images), 3.6)
+    for axes, image, title in zip(panels[0], images, titles, strict=True):
+        axes.imshow(image[..., ::-1])
+        axes.set_title(title, fontsize=10)
+    save(figure, out)
+
+
+def sight(seen: Sight, config: ArenaConfig, out: Path) -> None:
+    """How a robot's image comes about, and what each robot sees (Fig. 3).
+
+    (a) the grey arena with the rectangle around one robot, zeros beyond the border; (b) that
+    rectangle resized; (c) the state of every robot, a row each, oldest image first.
+    """
+    num, stack = seen.states.shape[:2]
+    figure = Figure(figsize=(8.6 + 0.9 * stack, 4.4), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    widths = (4.3, 4.3, max(2, 0.9 * stack))
+    left, middle, right = figure.subfigures(1, 3, squeeze=False, width_ratios=widths)[0]
+    _show_grey(left.subplots(), seen, config)
+    axes = middle.subplots()
+    axes.imshow(seen.view, cmap="gray", vmin=0, vmax=255)
+    axes.set_title(f"(b) resized to {config.view_px} x {config.view_px}", fontsize=10)
+    axes.set_axis_off()
+    right.suptitle("(c) states", fontsize=10)
+    for robot, row in enumerate(right.subplots(num, stack, squeeze=False)):
+        for axes, image in zip(row, seen.states[robot], strict=True):
+            axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+            axes.set(xticks=[], yticks=[])
+        row[0].set_ylabel(f"robot {robot + 1}", fontsize=8)
+    save(figure, out)
+
+
+def comparison(rows: Sequence[Contender], config: ArenaConfig, out: Path) -> None:
+    """Several policies from the same starts: a row each, a start a column (Fig. 10)."""
+    figure, panels = _panels(len(rows), len(rows[0].episodes), 3.1)
+    for row, contender in zip(panels, rows, strict=True):
+        for axes, episode in zip(row, contender.episodes, strict=True):
+            draw_paths(axes, episode, config)
+        row[0].text(
+            -0.04, 0.5, contender.name, transform=row[0].transAxes,
+            rotation=90, ha="right", va="center", fontweight="bold",
+        )  # fmt: skip
+    save(figure, out)
+
+
+def curves(run_dirs: Sequence[Path], out: Path) -> None:
+    """Successes of several runs over what they have learned (Figs. 7 g to i, and the test).
+
+    Raises RunDirectoryError for records of another kind.
+    """
+    figure = Figure(figsize=(9, 7.5), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    training, test = figure.subplots(2, 1)
+    dress(training, "(a) successes per 100 episodes of training", "episodes", "successes")
+    dress(test, "(b) success in the paper's test", "learner steps", "success, %")
+    for number, run_dir in enumerate(run_dirs):
+        colour = _COLOURS[number % len(_COLOURS)]
+        won = [record.episode.outcome is Outcome.SUCCESS for record in read_episodes(run_dir)]
+        training.plot(*means(HUNDRED * np.array(won, float), HUNDRED), color=colour)
+        tests = sorted((e.evaluation for e in read_evaluations(run_dir)), key=_learner_step)
+        steps = [e.learner_step for e in tests]
+        test.plot(steps, [100 * e.success_rate for e in tests], color=colour, label=run_dir.name)
+        bounds = 100 * np.array([e.success_interval for e in tests], float).reshape(-1, 2)
+        test.fill_between(steps, *bounds.T, color=colour, alpha=0.15, lw=0)
+    for axes in (training, test):
+        axes.set_ylim(-2, 102)
+        axes.set_xlim(left=0)
+        if not any(len(line.get_xdata()) for line in axes.get_lines()):
+            say(axes, "no records")
+    test.legend(loc="lower right", frameon=False)
+    save(figure, out)
+
+
+def check_suffix(out: Path) -> None:
+    """Raises MrcdrlError unless it is one that can be drawn."""
+    if out.suffix not in SUFFIXES:
+        raise MrcdrlError(f"figure {out}: the name ends in none of {', '.join(SUFFIXES)}")
+
+
+def _learner_step(test: Evaluation) -> int:
+    return test.learner_step
+
+
+def _show_grey(axes: Axes, seen: Sight, config: ArenaConfig) -> None:
+    """The arena in grey on black, and the rectangle, which may reach beyond it."""
+    size, crop = config.size_px, config.crop_px
+    x, y, heading = seen.pose
+    turned = np.degrees(heading) + 90 if config.orientation == "heading_up" else 0.0
+    axes.imshow(seen.grey, cmap="gray", vmin=0, vmax=255, extent=(0, size, size, 0))
+    corner = (x - crop / 2, y - crop / 2)
+    window = Rectangle(
+        corner, crop, crop, angle=turned, rotation_point="center",
+        fill=False, ec="#ff9020", lw=1.6, clip_on=False,
+    )  # fmt: skip
+    axes.add_patch(window)
+    axes.add_patch(Rectangle((0, 0), size, size, fill=False, ec="#777777", lw=0.8, ls=":"))
+    places = np.concatenate([window.get_corners(), [(0, 0), (size, size)]])
+    (left, top), (right, bottom) = places.min(axis=0) - 4, places.max(axis=0) + 4
+    axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], facecolor="black")
+    axes.set_title("(a) grey, zeros beyond the border", fontsize=10)
+
+
+def _panels(rows: int, columns: int, side: float) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes [rows, columns], bare; side: inches of a panel."""
+    figure = Figure(figsize=(side * columns, (side + 0.25) * rows), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.flat:
+        axes.set_axis_off()
+    return figure, panels

@@ -1,0 +1,1 @@
+"""`mrcdrl replay inspect`: what the replay log of a run holds, read from its files."""

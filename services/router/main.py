@@ -1,0 +1,48 @@
+"""`mrcdrl router`: a Zenoh router, to which all processes of a run connect."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from mrcdrl.common.config import load_transport
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.runtime.heartbeat import Heartbeat
+from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.transport import ROUTER_FILE, Refusals, Session
+
+_TICK_S = 1.0
+
+
+def main(argv: Sequence[str]) -> int:
+    """Relay until told to stop; the exit code."""
+    parser = Parser(prog="mrcdrl router", description="Relay between the processes of runs.")
+    parser.add_argument(
+        "--config", type=Path, default=ROUTER_FILE, help="a file such as configs/router.json5"
+    )
+    parser.add_argument(
+        "--listen",
+        action="append",
+        help="endpoint, such as tcp/0.0.0.0:7447; by default the file's",
+    )
+    parser.add_argument(
+        "--connect", action="append", help="another router's endpoint, to link to when it is there"
+    )
+    add_config_flags(parser, only=("transport",))
+    arguments = parser.parse_args(argv)
+    given = load_transport(overrides(arguments))
+    transport = given.model_copy(
+        update={
+            "listen": tuple(arguments.listen or given.listen),
+            "connect": tuple(arguments.connect or given.connect),
+        }
+    )
+    heartbeat = Heartbeat.of_environment()
+    stop = StopSignal().listen(STOP_DEADLINE_S)
+    with ExitStack() as owned:
+        if transport.key:
+            owned.enter_context(Refusals())
+        owned.enter_context(Session(transport, router_file=arguments.config))
+        while not stop.wait(_TICK_S):
+            heartbeat.worked()
+            heartbeat.beat()
+    return 0

@@ -1,0 +1,142 @@
+"""`mrcdrl status`: who is in a run that is up, how fast it goes, and what limits it."""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any
+
+from rich.console import Console
+
+from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.runtime.heartbeat import Heartbeat
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.versions import PACKAGES
+from mrcdrl.common.sync.joining import fetch_config, joining_of, joining_parser
+from mrcdrl.common.transport import Session
+from mrcdrl.services.monitor.bottleneck import limiting_stage
+from mrcdrl.services.monitor.display import display
+from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.recorder import Recorder, flat_metrics
+from mrcdrl.services.monitor.run_directory import RunDirectory
+from mrcdrl.services.monitor.screen import screen
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.stopping import StoppingRule
+
+VERSIONED = ("python", *PACKAGES)
+_TICK_S = 0.25
+_LISTEN_S = 3.0  # every service speaks once a second, and two words of it make a rate
+_JSON_PERIOD_S = 1.0
+Show = Callable[[], None]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Show, or keep the record, of a run; the exit code."""
+    arguments = parser().parse_args(argv)
+    joining, stop = joining_of(arguments), StopSignal().listen()
+    with ExitStack() as owned:
+        session = owned.enter_context(Session(joining.transport))
+        config = fetch_config(session, joining, stop)
+        recorder = None
+        if arguments.record:
+            run = owned.enter_context(RunDirectory.join(joining.run_dir, config))
+            recorder = owned.enter_context(Recorder(run.path, config))
+            session.announce(joining.keys.live("status", joining.worker))
+        state, rule = RunState(config), StoppingRule(config.run)
+        follower = Follower(session, joining.keys, state, recorder, rule)
+        if not (arguments.watch or arguments.record):
+            listen(follower, Heartbeat(None), stop, lambda: None, until_s=_LISTEN_S)
+            print_once(state, follower.now, joining.run, arguments.json)
+            return 0
+        showing: AbstractContextManager[Show] = (
+            json_lines(state, lambda: follower.now)
+            if arguments.json
+            else display(state, config, joining.run, lambda: follower.now)
+        )
+        # Of a service only: who looks at one from within its container must not beat for it.
+        heartbeat = Heartbeat.of_environment() if arguments.record else Heartbeat(None)
+        with showing as show:
+            listen(follower, heartbeat, stop, show)
+        if recorder is not None:
+            recorder.write_summary(state, follower.now, "stopped by hand")
+    return 0
+
+
+def parser() -> Parser:
+    """The command's flags."""
+    made = joining_parser("status", "What a run that is up does, and what limits it.")
+    made.add_argument("--watch", action="store_true", help="go on until told to stop")
+    made.add_argument("--json", action="store_true", help="as JSON, one object a line")
+    made.add_argument(
+        "--record", action="store_true", help="go on, and write down what `mrcdrl train` would"
+    )
+    return made
+
+
+def listen(
+    follower: Follower,
+    heartbeat: Heartbeat,
+    stop: StopSignal,
+    show: Show,
+    until_s: float = math.inf,
+) -> None:
+    """Take in what the run says, and show it, until stopped or the time is over."""
+    beat_s = 0.0
+    while not stop.is_set() and follower.lived_s < until_s:
+        if follower.listen(_TICK_S):
+            heartbeat.worked()
+        show()
+        if follower.lived_s >= beat_s:
+            beat_s = follower.lived_s + 1.0
+            heartbeat.beat()
+
+
+def print_once(state: RunState, now: float, run: str, as_json: bool) -> None:
+    """The screen, or the JSON, of this moment."""
+    console = Console()
+    if as_json:
+        console.out(json.dumps(status(state, now)), highlight=False)
+    else:
+        console.print(screen(state, state.config, now, run), height=console.height - 1)
+
+
+@contextmanager
+def json_lines(state: RunState, clock: Callable[[], float]) -> Iterator[Show]:
+    """A function that prints the status as a line of JSON once a second."""
+    console, due_s = Console(), [0.0]
+
+    def print_line() -> None:
+        if clock() >= due_s[0]:
+            due_s[0] = clock() + _JSON_PERIOD_S
+            console.out(json.dumps(status(state, clock())), highlight=False)
+
+    yield print_line
+
+
+def status(state: RunState, now: float) -> dict[str, Any]:
+    """Who is there, what limits, and every figure that the record has of a second."""
+    last = state.last_evaluation
+    return {
+        "limited_by": limiting_stage(state).replace("\N{NO-BREAK SPACE}", " "),
+        "services": [
+            {
+                "role": s.role,
+                "id": s.id,
+                "alive": s.alive,
+                "silent_s": finite(s.silent_s(now)),
+                "slot": s.slot,
+                "versions": {name: s.text[name] for name in VERSIONED if name in s.text},
+            }
+            for s in state.services
+        ],
+        "replay_size": state.replay_size,
+        "replay_capacity": state.replay_capacity,
+        "success_rate": last.evaluation.success_rate if last else None,
+        "evaluated_version": last.evaluation.weights_version if last else None,
+        **{name: finite(value) for name, value in flat_metrics(state, now).items()},
+    }
+
+
+def finite(value: float | None) -> float | None:
+    """Null for what JSON has no number for."""
+    return None if value is None or not math.isfinite(value) else round(value, 6)

@@ -1,0 +1,52 @@
+"""Evaluation episodes as images: the arena beside what its robots see.
+
+Invariants: drawn from poses, so that noise is like the noise they saw, and no frame is dropped.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mrcdrl.common.arena import Scene, make_codec, render_arena
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import UInt8Array
+from mrcdrl.services.evaluator.trial import EpisodeResult
+from mrcdrl.services.plots.film import compose_frame
+
+_ARENA_PX = 600
+_HOLD_FRAMES = 20  # the last image of an episode stays a moment
+
+
+class Moment(NamedTuple):
+    """One frame of an episode."""
+
+    episode: int  # from 1
+    frame: int  # from 0
+    scene: Scene
+    views: UInt8Array  # [K, V, V], what the robots see
+    ending: str  # the outcome in the last frame, else empty
+
+
+def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[Moment]:
+    """All frames of these episodes, one after the other."""
+    codec = make_codec(config)
+    for number, episode in enumerate(episodes, 1):
+        last = len(episode.robots) - 1
+        for frame, robots in enumerate(episode.robots):
+            scene = Scene(robots, episode.targets, episode.obstacles)
+            noise_seeds = np.arange(len(robots), dtype=np.uint32) + frame * len(robots)
+            views = codec.decode(codec.encode(scene, noise_seeds))
+            ending = episode.outcome.value if frame == last else ""
+            yield Moment(number, frame, scene, views, ending)
+
+
+def film_frames(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[UInt8Array]:
+    """Images uint8 BGR [H, W, 3] of these episodes, one after the other."""
+    for number, frame, scene, views, ending in moments(config, episodes):
+        caption = f"episode {number} of {len(episodes)}   frame {frame}"
+        if ending:
+            caption += f"   {ending}"
+        image = compose_frame(render_arena(scene, config, _ARENA_PX), views, caption)
+        for _ in range(_HOLD_FRAMES if ending else 1):
+            yield image

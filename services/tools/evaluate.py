@@ -1,0 +1,86 @@
+"""`mrcdrl evaluate`: the paper's test (section 5.3, Table 2) for weights or a controller."""
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+from rich.console import Console
+from rich.progress import Progress
+
+from mrcdrl.common.arena import test_starts
+from mrcdrl.common.messages.trajectory import Evaluation
+from mrcdrl.services.evaluator.navigation import Navigation, navigation, navigation_table
+from mrcdrl.services.evaluator.score import evaluation
+from mrcdrl.services.evaluator.trial import play
+from mrcdrl.services.tools.subject import Subject, subject, subject_parser
+
+
+def main(argv: Sequence[str]) -> int:
+    """Evaluate and print; the exit code."""
+    parser = subject_parser("evaluate", "The paper's test: one collision fails, epsilon 0.01.")
+    parser.add_argument("--episodes", type=int, default=1100, help="starts; the paper's 1100")
+    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    arguments = parser.parse_args(argv)
+    if arguments.episodes < 1:
+        parser.error(f"--episodes {arguments.episodes}: at least 1")
+    judged = subject(arguments)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("episodes", total=arguments.episodes)
+        result, measures = judge(
+            judged,
+            arguments.episodes,
+            arguments.seed,
+            lambda done: progress.update(task, completed=done),
+        )
+    if arguments.json:
+        navigated = {"navigation": dataclasses.asdict(measures)}
+        print(json.dumps(dataclasses.asdict(result) | navigated))
+    else:
+        sys.stdout.write(table(result, judged) + navigation_table(measures))
+    return 0
+
+
+def judge(
+    judged: Subject, episodes: int, seed: int, report: Callable[[int], None]
+) -> tuple[Evaluation, Navigation]:
+    """The paper's measures and those of navigation; `report` is told how many episodes are done."""
+    began_s = time.monotonic()
+    starts = test_starts(judged.config.arena, episodes, seed)
+
+    def go_on(done: int) -> bool:
+        report(done)
+        return True
+
+    results = play(judged.config.arena, starts, judged.player(seed), go_on=go_on) or []
+    result = evaluation(
+        results,
+        worker=judged.controller or "evaluate",
+        weights=judged.weights,
+        num_robots=judged.config.arena.num_robots,
+        seed=seed,
+        wall_s=time.monotonic() - began_s,
+    )
+    outcomes, frames = [r.outcome for r in results], [r.frames for r in results]
+    return result, navigation(outcomes, frames, [r.journey for r in results])
+
+
+def table(result: Evaluation, judged: Subject) -> str:
+    """The result for a reader."""
+    low, high = result.success_interval
+    who = (
+        f"controller {judged.controller}, which sees the true state"
+        if judged.controller
+        else f"weights of learner step {result.learner_step}, from images alone"
+    )
+    return f"""{who}
+{result.num_robots} robots, {result.episodes} episodes, epsilon {judged.config.evaluator.epsilon:g}
+  success    {result.success_rate:7.2%}   (95 % interval {low:.2%} to {high:.2%})
+  collision  {result.collision_rate:7.2%}
+  time-out   {result.timeout_rate:7.2%}
+  successes per 100: max {result.max_per_100:.0f}, average {result.mean_per_100:.2f}, \
+variance {result.variance_per_100:.2f}
+"""

@@ -1,0 +1,184 @@
+"""`mrcdrl figure`: the paper's images of any run, weights or controller.
+
+`arena`: Fig. 1, a start. `views`: Fig. 3, how a robot's image comes about. `trajectories`:
+Fig. 8, episodes of one policy. `comparison`: Fig. 10, several policies from the same starts.
+`curves`: Fig. 7, successes of several runs over what they have learned.
+"""
+
+import argparse
+import copy
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mrcdrl.common.arena import Scene, literal_views, make_codec, render_arena, test_starts
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.errors import ConfigError, RunDirectoryError
+from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
+from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.services.plots.figures import Path2D, trajectories
+from mrcdrl.services.plots.paper import (
+    Contender,
+    Sight,
+    arenas,
+    check_suffix,
+    comparison,
+    curves,
+    sight,
+)
+from mrcdrl.services.tools.subject import (
+    Subject,
+    add_arena_flags,
+    config_without_weights,
+    controlled,
+    subject,
+)
+
+_ARENA_PX = 900
+_GREY_WEIGHTS = (0.114, 0.587, 0.299)  # OpenCV's, of blue, green and red
+# What makes two arenas the same world; rewards and images may differ from policy to policy.
+_WORLD = (
+    "num_robots", "size_px", "wall_offset_px", "wall_thickness_px", "robot_radius_px",
+    "target_size_px", "turn_deg", "step_px", "target_layout", "targets_px",
+    "success_radius_px", "back_off_frames", "max_frames",
+)  # fmt: skip
+
+
+def main(argv: Sequence[str]) -> int:
+    """Draw; the exit code."""
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.episodes is not None and arguments.episodes < 1:
+        parser.error(f"--episodes {arguments.episodes}: at least 1")
+    if arguments.frame < 0:
+        parser.error(f"--frame {arguments.frame}: at least 0")
+    check_suffix(arguments.out)
+    _FIGURES[arguments.figure](arguments)
+    return 0
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="mrcdrl figure", description=__doc__)
+    parser.add_argument("figure", choices=list(_FIGURES), help="which")
+    parser.add_argument("weights", nargs="*", type=Path, help=".safetensors files, or runs")
+    parser.add_argument("--out", type=Path, required=True, help="the .png or .svg to write")
+    parser.add_argument(
+        "--controller", action="append", default=[], help="beside weights or instead of them"
+    )
+    parser.add_argument("--episodes", type=int, help="episodes to show: 12, 4 to compare")
+    parser.add_argument("--frame", type=int, default=40, help="of the episode, for `views`")
+    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
+    add_arena_flags(parser)
+    return parser
+
+
+def _arena(arguments: argparse.Namespace) -> None:
+    """A test start of every arena that is named, or of --config's."""
+    named = [shown.config for shown in _subjects(arguments)]
+    configs = [config.arena for config in named or [config_without_weights(arguments)]]
+    images = []
+    for config in configs:
+        (start,) = test_starts(config, 1, arguments.seed)
+        scene = Scene(start.robots, start.targets)
+        images.append(render_arena(scene, config, _ARENA_PX, smooth=True))
+    arenas(images, [f"{config.num_robots} robots" for config in configs], arguments.out)
+
+
+def _views(arguments: argparse.Namespace) -> None:
+    """Of the lowermost robot, as in the"""
+    shown = _one(arguments)
+    config = shown.config.arena
+    (episode,) = _episodes(shown, 1, arguments.seed)
+    frame = min(arguments.frame, episode.frames)
+    before = range(frame - config.stack + 1, frame + 1)
+    scenes = [Scene(episode.robots[max(0, at)], episode.targets) for at in before]
+    robot = int(scenes[-1].robots[:, 1].argmax())
+    codec = make_codec(config)
+    states = np.stack([codec.decode(codec.encode(scene)) for scene in scenes], axis=1)
+    seen = Sight(
+        grey=_grey(scenes[-1], config),
+        pose=scenes[-1].robots[robot],
+        view=literal_views(scenes[-1], config)[robot],
+        states=states,
+    )
+    sight(seen, config, arguments.out)
+
+
+def _trajectories(arguments: argparse.Namespace) -> None:
+    shown = _one(arguments)
+    episodes = _episodes(shown, arguments.episodes or 12, arguments.seed)
+    trajectories(_paths(episodes), shown.config.arena, arguments.out)
+
+
+def _comparison(arguments: argparse.Namespace) -> None:
+    """Names the field when the policies do not live in the same world (ConfigError)."""
+    subjects = _subjects(arguments)
+    if len(subjects) < 2:
+        raise ConfigError("a comparison takes at least two weights or controllers")
+    world = subjects[0].config.arena
+    for other in subjects[1:]:
+        for name in _WORLD:
+            if getattr(other.config.arena, name) != getattr(world, name):
+                raise ConfigError(f"not the same arena: arena.{name} differs; set it by its flag")
+    rows = []
+    for name, shown in zip(_names(arguments), subjects, strict=True):
+        episodes = _episodes(shown, arguments.episodes or 4, arguments.seed)
+        won = sum(episode.outcome is Outcome.SUCCESS for episode in episodes)
+        rows.append(Contender(f"{name}: {won} of {len(episodes)}", _paths(episodes)))
+    comparison(rows, world, arguments.out)
+
+
+def _curves(arguments: argparse.Namespace) -> None:
+    """Of what the runs have recorded; nothing is played."""
+    if not arguments.weights or arguments.controller:
+        raise ConfigError("curves are drawn of runs: give their folders")
+    for run_dir in arguments.weights:
+        if not run_dir.is_dir():
+            raise RunDirectoryError(f"{run_dir} is no run's folder")
+    curves(arguments.weights, arguments.out)
+
+
+_FIGURES: dict[str, Callable[[argparse.Namespace], None]] = {
+    "arena": _arena,
+    "views": _views,
+    "trajectories": _trajectories,
+    "comparison": _comparison,
+    "curves": _curves,
+}
+
+
+def _subjects(arguments: argparse.Namespace) -> list[Subject]:
+    """Everything that is named, weights first; controllers play in the arena of the first."""
+    subjects = []
+    for path in arguments.weights:
+        alone = copy.copy(arguments)
+        alone.weights, alone.controller = path, None
+        subjects.append(subject(alone))
+    config = subjects[0].config if subjects else config_without_weights(arguments)
+    return subjects + [controlled(name, config) for name in arguments.controller]
+
+
+def _one(arguments: argparse.Namespace) -> Subject:
+    if len(arguments.weights) + len(arguments.controller) != 1:
+        raise ConfigError(f"{arguments.figure} takes one: either weights or --controller")
+    return _subjects(arguments)[0]
+
+
+def _names(arguments: argparse.Namespace) -> list[str]:
+    return [*(path.resolve().stem for path in arguments.weights), *arguments.controller]
+
+
+def _episodes(shown: Subject, num: int, seed: int) -> list[EpisodeResult]:
+    starts = test_starts(shown.config.arena, num, seed)
+    return play(shown.config.arena, starts, shown.player(seed), keep_paths=True) or []
+
+
+def _paths(episodes: Sequence[EpisodeResult]) -> list[Path2D]:
+    return [Path2D(e.robots, e.targets, e.obstacles, e.outcome) for e in episodes]
+
+
+def _grey(scene: Scene, config: ArenaConfig) -> UInt8Array:
+    grey: Float64Array = render_arena(scene, config, config.size_px) @ np.array(_GREY_WEIGHTS)
+    return np.rint(grey).astype(np.uint8)

@@ -1,0 +1,34 @@
+"""Compiles what runs compiled, so that no first start has to.
+
+That is what moves and draws robots, and the network's first layer, as actors (states without gaps)
+and the learner (views of longer windows) call it. The machine code goes where numba keeps it
+(NUMBA_CACHE_DIR); another processor compiles anew.
+"""
+
+import numpy as np
+import torch
+
+from mrcdrl.common.arena import make_arenas, make_codec
+from mrcdrl.common.config import Config
+from mrcdrl.common.model.q_network import QNetwork
+
+
+def main() -> None:
+    """One step of a new episode, drawn as actors do; values of states, and their gradient."""
+    config = Config()
+    arena = config.arena
+    arenas = make_arenas(arena, [np.random.default_rng(0)], [0])
+    codec = make_codec(arena)
+    codec.decode(arenas.reset(0).records)
+    steps = arenas.step(np.zeros((1, arena.num_robots), np.uint8))
+    codec.decode(steps.records.reshape(arena.num_robots, -1))
+
+    network = QNetwork(config.agent.kind, stack=arena.stack, view_px=arena.view_px)
+    windows = torch.zeros(2, arena.stack + 1, arena.view_px, arena.view_px, dtype=torch.uint8)
+    for states in (windows[:, : arena.stack].contiguous(), windows[:, : arena.stack]):
+        values = network.evaluate(network.prepare(states), network.operands())
+        values.sum().backward()  # type: ignore[no-untyped-call]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""`mrcdrl report RUN`: training.png, trajectories.png and evaluation.mp4 of a run."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mrcdrl.common.arena import test_starts
+from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.errors import CheckpointError, RunDirectoryError
+from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
+from mrcdrl.services.plots.film import write_film
+from mrcdrl.services.tools.episode_frames import film_frames
+from mrcdrl.services.tools.render import FPS
+from mrcdrl.services.tools.subject import subject, subject_parser
+
+_EPISODES = 12
+_FILMED = 4
+_SEED = 0
+
+
+def main(argv: Sequence[str]) -> int:
+    """Draw; the exit code."""
+    parser = Parser(prog="mrcdrl report", description="The images and the film of a run.")
+    parser.add_argument("run", type=Path, help="the run's folder")
+    run_dir: Path = parser.parse_args(argv).run
+    if not run_dir.is_dir():
+        raise RunDirectoryError(f"{run_dir} is no folder")
+    training_curve(run_dir, run_dir / "training.png")
+    draw_episodes(run_dir)
+    return 0
+
+
+def draw_episodes(run_dir: Path) -> None:
+    """Trajectories and film of the run's best weights; CheckpointError where it has none."""
+    shown = subject(subject_parser("report", "").parse_args([str(run_dir)]))
+    arena = shown.config.arena
+    starts = test_starts(arena, _EPISODES, _SEED)
+    results = play(arena, starts, shown.player(_SEED), keep_paths=True)
+    if results is None:
+        raise CheckpointError(f"{run_dir}: no episode was played")
+    paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]
+    trajectories(paths, arena, run_dir / "trajectories.png")
+    write_film(run_dir / "evaluation.mp4", film_frames(arena, shortest(results)), FPS)
+
+
+def shortest(results: Sequence[EpisodeResult]) -> list[EpisodeResult]:
+    """A few episodes worth watching: the shortest."""
+    return sorted(results, key=lambda r: r.frames)[:_FILMED]

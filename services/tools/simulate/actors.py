@@ -1,0 +1,327 @@
+"""Actors without arena and inference: what they put on the wire is real, what is in it is not.
+
+Each simulated actor has what a real one has there: two sessions, a liveliness token, a `Sender`
+with its thread, a subscription to the weights, statistics once a second, a summary of each
+episode. Invariants: a full spool stops an actor's clock, as it stops arenas; a process that runs
+them ends when its parent does.
+"""
+
+import signal
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import count
+from multiprocessing.connection import Connection
+from time import monotonic, time_ns
+from typing import Protocol
+
+import numpy as np
+
+from mrcdrl.common.config import Config, TransportConfig
+from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.trajectory import (
+    NO_SLOT,
+    NUM_ACTIONS,
+    Chunk,
+    EpisodeSummary,
+    Float64Array,
+    InsertReply,
+    Outcome,
+    UInt8Array,
+)
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
+from mrcdrl.services.actor.sender import Sender
+from mrcdrl.services.replay.client import ReplayWriter, shard_of
+
+EPISODE_FRAMES = 186  # mean of benchmarks/results/quick-2robots
+_EPISODES = 8  # different ones; then they come again
+_TICK_S = 0.01
+_TELL_S = 1.0
+BEGIN, STOP = "begin", "stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a process is to simulate."""
+
+    config: Config
+    run: str
+    transport: TransportConfig
+    workers: tuple[str, ...]  # names of the actors, or of the one learner
+    rate: float  # robot steps per second of an actor, publications per second of a learner
+
+    @property
+    def keys(self) -> Keys:
+        return Keys(self.run)
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What a process did since it began, and how long the inserts since its last tally took."""
+
+    seconds: float = 0.0  # since it began
+    counts: Counter[str] = field(default_factory=Counter)
+    insert_s: Float64Array = field(default_factory=lambda: np.empty(0))
+    last: bool = False
+
+
+class Party(Protocol):
+    """Whoever a process simulates."""
+
+    def begin(self, now_s: float) -> None: ...
+    def work(self, now_s: float) -> None: ...
+    def done(self) -> tuple[Counter[str], Float64Array]: ...
+
+
+def follow(connection: Connection, party: Party) -> None:
+    """Work from the parent's word to its next, and tell it once a second what was done.
+
+    A parent that is gone has said the last word.
+    """
+    connection.send(Tally())
+    connection.recv()
+    began_s = told_s = monotonic()
+    party.begin(began_s)
+    while not connection.poll(_TICK_S):
+        party.work(monotonic())
+        if monotonic() - told_s >= _TELL_S:
+            told_s = monotonic()
+            connection.send(Tally(told_s - began_s, *party.done()))
+    connection.recv()
+    connection.send(Tally(monotonic() - began_s, *party.done(), last=True))
+
+
+@contextmanager
+def answering(connection: Connection) -> Iterator[None]:
+    """Ctrl-C is for the parent, which is told in a line what went wrong."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    except (EOFError, BrokenPipeError):
+        return
+    except MrcdrlError as error:
+        connection.send(str(error))
+
+
+def act(plan: Plan, connection: Connection) -> None:
+    """A process's simulated actors, until the parent says stop."""
+    with answering(connection), ExitStack() as owned:
+        actors = SimulatedActors(plan)
+        owned.callback(actors.close)
+        follow(connection, actors)
+
+
+class TimedWriter(ReplayWriter):
+    """Notes how long an acknowledgement took, from the first asking on."""
+
+    def __init__(self, session: Session, plan: Plan, worker: str, stop: StopSignal) -> None:
+        warn_s, num_shards = plan.config.actor.warn_s, plan.config.replay.shards
+        shard = shard_of(worker, num_shards)
+        super().__init__(session, plan.keys, warn_s, stop, shard=shard, num_shards=num_shards)
+        self.insert_s: deque[float] = deque()
+        self.requests = 0
+
+    def insert(self, chunks: Sequence[Chunk]) -> InsertReply | None:
+        asked_s = monotonic()
+        reply = super().insert(chunks)
+        if reply is not None:
+            self.requests += 1
+            self.insert_s.append(monotonic() - asked_s)
+        return reply
+
+
+class SimulatedActor:
+    """One actor as replay, router and learner see it."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        worker: str,
+        chunks: Sequence[Chunk],
+        session: Session,
+        writer: TimedWriter,
+    ) -> None:
+        config, keys = plan.config, plan.keys
+        self._worker, self._rate, self._chunks = worker, plan.rate, chunks
+        self._incarnation, self._sequence = time_ns(), 0
+        self._episode_steps = EPISODE_FRAMES * config.arena.num_robots
+        self._made = self._episodes = 0
+        self._due_s = 0.0
+        self.waited_s = 0.0
+        self.counts: Counter[str] = Counter()
+        session.announce(keys.live("actor", worker))
+        self._peers = session.presence(keys.everyone("actor"))
+        self._weights = session.latest_subscriber(keys.weights)
+        self._summaries = session.publisher(keys.episodes(worker))
+        self._reporter = StatsReporter(
+            session.publisher(keys.stats("actor", worker)), "actor", worker
+        )
+        self.writer = writer
+        self.sender = Sender(writer, config.actor.spool_chunks)
+
+    def begin(self, now_s: float, phase: float) -> None:
+        """phase: 0 to 1, of a chunk's time until the first is due."""
+        self._due_s = now_s + phase * len(self._chunks[0]) / self._rate
+
+    def work(self, now_s: float) -> None:
+        """Spool the chunks that are due, take the weights that came, tell."""
+        while self._due_s <= now_s and self._spool(now_s):
+            pass
+        weights = self._weights.take()
+        if weights is not None:
+            self.counts.update(weights=1, weights_bytes=len(weights))
+        self._peers.alive()
+        self._reporter.maybe(self._said)
+
+    def _spool(self, now_s: float) -> bool:
+        chunk = replace(
+            self._chunks[self._sequence % len(self._chunks)],
+            actor=self._worker,
+            incarnation=self._incarnation,
+            sequence=self._sequence,
+        )
+        if not self.sender.put(chunk, timeout_s=0.0):
+            self.waited_s += now_s - self._due_s
+            self._due_s = now_s
+            return False
+        self._sequence += 1
+        self._made += len(chunk)
+        self._due_s += len(chunk) / self._rate
+        if self._made >= (self._episodes + 1) * self._episode_steps:
+            self._episodes += 1
+            self._summaries.put(encode(self._summary()))
+        return True
+
+    def _summary(self) -> EpisodeSummary:
+        return EpisodeSummary(
+            actor=self._worker,
+            arena=0,
+            episode=self._episodes,
+            outcome=Outcome.TIMEOUT,
+            frames=EPISODE_FRAMES,
+            score=0.0,
+            collisions=0,
+            epsilon=1.0,
+            weights_version=0,
+            mean_q=0.0,
+        )
+
+    def _said(self) -> dict[str, float]:
+        """Every name that an actor tells; 0 for what is not simulated."""
+        told = {
+            "robot_steps": self._made,
+            "episodes": self._episodes,
+            "chunks": self.sender.chunks,
+            "inserts_acknowledged": self.sender.transitions,
+            "spool_chunks": self.sender.spooled,
+            "slot": NO_SLOT,
+        }
+        return dict.fromkeys(NOT_SIMULATED, 0.0) | told
+
+
+NOT_SIMULATED = (
+    *("env_steps", "weights_version", "weights_age_s", "weights_refused"),
+    *("epsilon_min", "epsilon_max", "inference_share", "arena_share", "draw_share"),
+    *("chunk_share", "wait_share"),
+)
+
+
+class SimulatedActors:
+    """All of one process, worked by one thread, beside a thread of each one's sender."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Raises EndpointError where nobody answers."""
+        self._stop, self._sessions = StopSignal(), ExitStack()
+        self._actors: list[SimulatedActor] = []
+        chunks = episode_chunks(plan.config)
+        try:
+            for worker in plan.workers:
+                session = self._sessions.enter_context(Session(plan.transport))
+                bulk = self._sessions.enter_context(Session(plan.transport))
+                writer = TimedWriter(bulk, plan, worker, self._stop)
+                self._actors.append(SimulatedActor(plan, worker, chunks, session, writer))
+        except MrcdrlError:
+            self.close()
+            raise
+
+    def begin(self, now_s: float) -> None:
+        for index, actor in enumerate(self._actors):
+            actor.begin(now_s, index / len(self._actors))
+
+    def work(self, now_s: float) -> None:
+        for actor in self._actors:
+            actor.work(now_s)
+
+    def done(self) -> tuple[Counter[str], Float64Array]:
+        counts: Counter[str] = Counter()
+        insert_s: list[float] = []
+        for actor in self._actors:
+            writer, sender = actor.writer, actor.sender
+            counts.update(actor.counts)
+            counts.update(transitions=sender.transitions, chunks=sender.chunks)
+            counts.update(
+                requests=writer.requests, held=writer.throttled, unanswered=writer.unanswered
+            )
+            counts.update(waited_ms=round(1000 * actor.waited_s))
+            insert_s += [writer.insert_s.popleft() for _ in range(len(writer.insert_s))]
+        return counts, np.array(insert_s)
+
+    def close(self) -> None:
+        """End all; what is spooled is dropped."""
+        self._stop.set()
+        with ThreadPoolExecutor(max(1, len(self._actors))) as pool:
+            list(pool.map(lambda actor: actor.sender.close(), self._actors))
+        self._sessions.close()
+
+
+def episode_chunks(config: Config) -> list[Chunk]:
+    """The chunks of a few episodes of a robot, of random steps but true shapes and lengths."""
+    rng, numbers = np.random.default_rng(0), count()
+    chunker = Chunker(
+        ChunkerConfig(
+            actor="simulated",
+            incarnation=0,
+            gamma=config.agent.gamma,
+            n_step=config.agent.n_step,
+            stack=config.arena.stack,
+            chunk_length=config.actor.chunk_length,
+            prioritized=config.replay.prioritized,
+            reward_scale=config.agent.reward_scale,
+        )
+    )
+    chunks: list[Chunk] = []
+    for _ in range(_EPISODES):
+        chunker.start(_record(config, rng))
+        for frame in range(1, EPISODE_FRAMES + 1):
+            last = frame == EPISODE_FRAMES
+            chunks += chunker.add(
+                int(rng.integers(NUM_ACTIONS)),
+                config.arena.step_reward,
+                _record(config, rng),
+                taken_q=float(rng.normal()),
+                greedy_q=float(rng.normal()),
+                weights_version=0,
+                last=last,
+                discount=0.0 if last else 1.0,
+                sequence=numbers,
+            )
+    return chunks
+
+
+def _record(config: Config, rng: np.random.Generator) -> UInt8Array:
+    """Poses anywhere in the arena, or a grey image with a block of noise on a tenth of it."""
+    length = config.arena.record_bytes
+    if config.arena.codec == "scene":
+        poses = rng.uniform(0, config.arena.size_px, length // 4).astype("<f4")
+        return poses.view(np.uint8)
+    image = np.full(length, 128, np.uint8)
+    start, size = rng.integers(length - length // 10), length // 10
+    image[start : start + size] = rng.integers(0, 256, size)
+    return image

@@ -1,0 +1,93 @@
+"""A learner that computes nothing: weights of the true size, and mini-batches drawn and dropped."""
+
+import threading
+from collections import Counter
+from contextlib import ExitStack
+from multiprocessing.connection import Connection
+from time import time_ns
+
+import numpy as np
+
+from mrcdrl.common.messages.trajectory import Float64Array, Priorities, Weights
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_io import SENT_AS, weights_to_bytes
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.weights import WeightsWriter
+from mrcdrl.common.transport import Session
+from mrcdrl.services.replay.client import PriorityWriter, ReplayReader
+from mrcdrl.services.tools.simulate.actors import Plan, answering, follow
+
+
+def learn(plan: Plan, connection: Connection) -> None:
+    """A process's simulated learner, until the parent says stop."""
+    with answering(connection), ExitStack() as owned:
+        session = owned.enter_context(Session(plan.transport))
+        bulk = owned.enter_context(Session(plan.transport))
+        learner = SimulatedLearner(plan, session, bulk)
+        owned.callback(learner.close)
+        follow(connection, learner)
+
+
+class SimulatedLearner:
+    """Publishes `plan.rate` times a second; draws as fast as replay's limiter lets it, if it has
+    one."""
+
+    def __init__(self, plan: Plan, session: Session, bulk: Session) -> None:
+        config, keys = plan.config, plan.keys
+        network = QNetwork(
+            config.agent.kind, stack=config.arena.stack, view_px=config.arena.view_px
+        )
+        self._payload = weights_to_bytes(network, SENT_AS[config.learner.publish_precision])
+        self._period_s = 1 / plan.rate if plan.rate else float("inf")
+        self._due_s, self._epoch, self._version = 0.0, time_ns(), 0
+        self._samples = 0
+        self._stop = StopSignal()
+        session.announce(keys.live("learner", plan.workers[0]))
+        self._weights = WeightsWriter(session, keys)
+        settings = config.learner
+        self._reader = ReplayReader(
+            bulk,
+            keys,
+            settings.batch_size,
+            settings.sample_size // settings.batch_size,
+            settings.requests_in_flight,
+            settings.warn_s,
+            self._stop,
+            num_shards=config.replay.shards,
+        )
+        self._priorities = (
+            PriorityWriter(bulk, keys, self._stop, num_shards=config.replay.shards)
+            if config.replay.prioritized
+            else None
+        )
+        self._draws = config.replay.samples_per_insert > 0
+        self._thread = threading.Thread(target=self._draw, name="draw")
+
+    def begin(self, now_s: float) -> None:
+        self._due_s = now_s + self._period_s
+        if self._draws:
+            self._thread.start()
+
+    def work(self, now_s: float) -> None:
+        """Publish if it is time; what is late by then is left out, as a learner does."""
+        if now_s >= self._due_s:
+            self._due_s += self._period_s
+            self._version += 1
+            self._weights.publish(Weights.of(self._epoch, self._version, 0, self._payload))
+
+    def done(self) -> tuple[Counter[str], Float64Array]:
+        return Counter(published=self._version, samples=self._samples), np.empty(0)
+
+    def close(self) -> None:
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._weights.close()
+
+    def _draw(self) -> None:
+        rng = np.random.default_rng(0)
+        while (samples := self._reader.sample()) is not None:
+            self._samples += len(samples)
+            if self._priorities is not None:
+                errors = rng.lognormal(0, 1, len(samples)).astype(np.float32)
+                self._priorities.update(Priorities(samples.keys, errors))

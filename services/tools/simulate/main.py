@@ -1,0 +1,136 @@
+"""`mrcdrl simulate`: the load of many actors on replay, without arenas and inference.
+
+Invariant: a run that is joined bears a name that says what its data are, unless --force says that
+they may spoil it.
+"""
+
+import argparse
+import json
+import math
+import os
+import resource
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+from mrcdrl.common.config import load_config
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.errors import ConfigError
+from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.runtime.process import StopSignal, available_cores
+from mrcdrl.services.monitor.summary import machine, versions
+from mrcdrl.services.tools.simulate.simulation import Demand, simulation
+from mrcdrl.services.tools.simulate.target import NAME, joined, own
+
+ROBOT_STEPS_PER_S = 4300.0  # of an actor that has a core of its own: docs/profile.md
+_FILES = 4  # of an actor, open in its process and in replay or the router: both have two ends
+_SPARE_FILES = 200
+
+
+def main(argv: Sequence[str]) -> int:
+    """Simulate; the exit code. The figures are a line of JSON; what goes on is told on stderr."""
+    arguments = _parse(argv)
+    _allow_open_files(arguments.actors)
+    stop = StopSignal().listen()
+    demand = Demand(arguments.actors, arguments.rate, arguments.processes, arguments.publications)
+    given = overrides(arguments)
+    with ExitStack() as owned:
+        target = owned.enter_context(
+            joined(arguments.run, arguments.connect, given, stop)
+            if arguments.connect
+            else own(load_config(arguments.config or "quick", given), router=arguments.router)
+        )
+        simulated = owned.enter_context(simulation(demand, target, f"simulated-{os.getpid()}"))
+        figures = simulated.run(60 * arguments.minutes, stop)
+    result = {
+        "command": " ".join(["mrcdrl simulate", *argv]),
+        "actors": demand.actors,
+        **figures,
+        "machine": machine(),
+        "versions": versions(),
+    }
+    sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
+    return 0
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser(prog="mrcdrl simulate", description=__doc__.splitlines()[0].split(": ")[1])
+    parser.add_argument("--actors", type=_count, default=200)
+    parser.add_argument("--minutes", type=_positive, default=1.0)
+    parser.add_argument(
+        "--rate",
+        type=lambda text: math.inf if text == "max" else _positive(text),
+        default=ROBOT_STEPS_PER_S,
+        help="robot steps per second of each actor, or max: as many as are acknowledged; by "
+        f"default {ROBOT_STEPS_PER_S:g}, what one makes that has a core of its own",
+    )
+    parser.add_argument("--processes", type=_count, help="that actors share; by default one a core")
+    parser.add_argument(
+        "--publications", type=_frequency, help="of weights per second; by default 1"
+    )
+    parser.add_argument("--router", action="store_true", help="put one before replay")
+    parser.add_argument("--config", help="a preset or a TOML file; by default quick")
+    parser.add_argument("--run", help=f"join this run instead; its name begins with {NAME}")
+    parser.add_argument("--connect", help="where it is, such as tcp/127.0.0.1:7447")
+    parser.add_argument(
+        "--force", action="store_true", help="join any run, whose learner learns what is made up"
+    )
+    add_config_flags(parser)
+    arguments = parser.parse_args(argv)
+    if bool(arguments.run) != bool(arguments.connect):
+        parser.error("--run and --connect go together; without them replay is started here")
+    if arguments.connect:
+        _check_joining(parser, arguments)
+    elif arguments.publications is None:
+        arguments.publications = 1.0
+    arguments.processes = min(arguments.processes or available_cores(), arguments.actors)
+    return arguments
+
+
+def _check_joining(parser: Parser, arguments: argparse.Namespace) -> None:
+    """Refuse what the run settles itself, and a run that is for something else."""
+    check_name(arguments.run, "run name")
+    settled = [f"--{name}" for name in ("config", "router") if getattr(arguments, name)]
+    settled += ["--publications"] * (arguments.publications is not None)
+    settled += [f"--{n}" for n in overrides(arguments) if not n.startswith("transport.")]
+    if settled:
+        parser.error(f"{settled[0]} is settled by the run: not with --connect")
+    if not (arguments.run.startswith(NAME) or arguments.force):
+        parser.error(
+            f"run {arguments.run!r} would learn what is made up; give a run whose name begins "
+            f"with {NAME!r}, or --force"
+        )
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: at least 1")
+    return number
+
+
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: a number above 0")
+    return number
+
+
+def _frequency(text: str) -> float:
+    return 0.0 if float(text) == 0 else _positive(text)
+
+
+def _allow_open_files(actors: int) -> None:
+    """As many as all sessions need, here and in the processes started from here.
+
+    Raises ConfigError where the system gives fewer.
+    """
+    needed = _FILES * actors + _SPARE_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if needed > hard != resource.RLIM_INFINITY:
+        raise ConfigError(
+            f"{actors} actors need {needed} open files, and the system allows {hard}: raise that "
+            "(ulimit -Hn), or simulate fewer"
+        )
+    if needed > soft != resource.RLIM_INFINITY:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))

@@ -1,0 +1,266 @@
+"""What a run of many actors would ask of replay, router and network: a model of measured costs.
+
+Invariants: pure; sizes are those of real messages, encoded; costs are measured ones, of the runs
+that benchmarks/results/simulate/README.md names. docs/generate.py writes the tables of
+docs/scaling.md by it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from mrcdrl.common.config import Config
+from mrcdrl.common.messages.trajectory import (
+    Chunk,
+    EpisodeSummary,
+    InsertReply,
+    Outcome,
+    Priorities,
+    PrioritiesReply,
+    SampleRequest,
+    Samples,
+    Stats,
+    Weights,
+)
+from mrcdrl.common.messages.wire import encode_parts
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_io import SENT_AS, weights_to_bytes
+from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, NOT_SIMULATED, episode_chunks
+
+# Processor seconds of replay's process, Zenoh's threads in it included, for
+INSERT_S = 0.36e-3  # a request to insert
+CHUNK_S = 0.06e-3  # each chunk in it
+SAMPLE_S = 0.41e-3  # a request for 128 transitions
+PAYLOAD_S = 1.4e-9  # a byte of records that crosses the network
+STATS_S = 0.13e-3  # a message of statistics, all else that an idle actor costs included
+# and of whoever relays, the router, or replay where it is the router, for
+RELAYED_BYTE_S = 0.58e-9  # a byte of weights, sent to one of many
+RELAYED_QUERY_S = 0.14e-3  # a request and its answer
+
+CORE = 0.9  # of a core, that one Python process can use
+LINK_BYTES = 1.25e9 * 0.8  # per second, 10 Gbit/s used to four fifths
+EVALUATORS = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """Messages of one kind, of all actors together."""
+
+    name: str
+    way: str
+    message_bytes: float
+    per_s: float
+
+    @property
+    def bytes_per_s(self) -> float:
+        return self.message_bytes * self.per_s
+
+    @property
+    def processor(self) -> tuple[str, float] | None:
+        """Whose, and seconds a message; None: not measured by itself, or next to nothing."""
+        return {
+            "chunks": ("replay", INSERT_S + CHUNK_S),
+            "samples": ("replay", SAMPLE_S),
+            "weights": ("router", self.message_bytes * RELAYED_BYTE_S),
+            "statistics": ("router", STATS_S),
+        }.get(self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast a run goes."""
+
+    actors: int
+    transitions_per_s: float  # of all actors
+    publications_per_s: float
+
+    @classmethod
+    def free(cls, actors: int, rate: float, publications_per_s: float = 1.0) -> "Pace":
+        """Nobody waits for the learner; `rate`: robot steps per second of an actor."""
+        return cls(actors, actors * rate, publications_per_s)
+
+    @classmethod
+    def held(cls, config: Config, actors: int, rate: float, updates_per_s: float) -> "Pace":
+        """The rate limiter lets in what the learner's updates draw."""
+        drawn = updates_per_s * config.learner.batch_size / config.replay.samples_per_insert
+        learner = config.learner
+        publications_per_s = updates_per_s / learner.publish_period
+        if learner.publish_interval_s:
+            publications_per_s = min(publications_per_s, 1 / learner.publish_interval_s)
+        return cls(actors, min(drawn, actors * rate), publications_per_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """What that would ask for."""
+
+    replay_cores: float
+    relay_cores: float
+    relay_bytes_per_s: float  # through the router
+    shards: int
+    routers: int
+    first: str  # what is full first, where there is one of each
+
+
+def flows(config: Config, pace: Pace) -> list[Flow]:
+    """Everything that crosses between actors, replay and learner, without repeats."""
+    chunk_bytes, chunk_length = _chunk(config)
+    chunks_per_s = pace.transitions_per_s / chunk_length
+    samples_per_s = pace.transitions_per_s * config.replay.samples_per_insert
+    size = config.learner.sample_size
+    episodes_per_s = pace.transitions_per_s / EPISODE_FRAMES / config.arena.num_robots
+    listeners = pace.actors + EVALUATORS
+    request, samples = SampleRequest(size), _samples(config, size)
+    found = [
+        Flow("chunks", "actor → replay", chunk_bytes, chunks_per_s),
+        Flow("acknowledgements", "replay → actor", _size(InsertReply(10**5, False, 10**8)),
+             chunks_per_s),
+        Flow("weights", "learner → actors", weights_bytes(config),
+             pace.publications_per_s * listeners),
+        Flow("statistics", "actor → who watches", _size(_stats()), pace.actors),
+        Flow("episodes", "actor → who watches", _size(_episode()), episodes_per_s),
+        Flow("sample requests", "learner → replay", _size(request), samples_per_s / size),
+        Flow("samples", "replay → learner", _size(samples), samples_per_s / size),
+    ]  # fmt: skip
+    if config.replay.prioritized:
+        batch = config.learner.batch_size
+        errors = Priorities(np.full(batch, 10**8), np.ones(batch, np.float32))
+        found += [
+            Flow("priorities", "learner → replay", _size(errors), samples_per_s / batch),
+            Flow("their acknowledgements", "replay → learner", _size(PrioritiesReply(batch, 0)),
+                 samples_per_s / batch),
+        ]  # fmt: skip
+    return found
+
+
+def need(config: Config, pace: Pace) -> Need:
+    """What has to be there for it, one chunk a request, all on hosts of their own."""
+    by_name = {flow.name: flow for flow in flows(config, pace)}
+    chunks, samples = by_name["chunks"], by_name["samples"]
+    drawn = config.learner.sample_size * samples.per_s
+    replay_cores = PAYLOAD_S * (chunks.bytes_per_s + samples.bytes_per_s) + replay_cpu(
+        inserts=chunks.per_s, chunks=chunks.per_s, samples=drawn
+    )
+    relay_cores = relay_cpu(
+        pace.actors, by_name["weights"].bytes_per_s, queries=chunks.per_s + samples.per_s
+    )
+    through = sum(flow.bytes_per_s for flow in by_name.values())
+    full = {
+        "replay's process": replay_cores / CORE,
+        "the router's process": relay_cores / CORE,
+        "the router's link": through / LINK_BYTES,
+    }
+    first = max(full, key=lambda name: full[name])
+    return Need(
+        replay_cores,
+        relay_cores,
+        through,
+        math.ceil(full["replay's process"]),
+        math.ceil(max(full["the router's process"], full["the router's link"])),
+        first if full[first] > 1 else "nothing",
+    )
+
+
+def replay_cpu(*, inserts: float, chunks: float, samples: float) -> float:
+    """Cores for so many requests to insert, chunks in them and transitions drawn a second."""
+    return inserts * INSERT_S + chunks * CHUNK_S + samples / 128 * SAMPLE_S
+
+
+def relay_cpu(actors: int, weights_bytes_per_s: float, *, queries: float) -> float:
+    """Cores to pass on the actors' statistics, the weights to each of them, and queries."""
+    passed = weights_bytes_per_s * RELAYED_BYTE_S + queries * RELAYED_QUERY_S
+    return actors * STATS_S + passed
+
+
+def expected(figures: Mapping[str, Any]) -> float:
+    """Cores of replay, which relays as well, by the model, for what `mrcdrl simulate` printed."""
+    worked = replay_cpu(
+        inserts=figures["inserts_per_s"],
+        chunks=figures["chunks_per_s"],
+        samples=figures["samples_per_s"],
+    )
+    if "shared_memory false" in figures["command"]:
+        worked += PAYLOAD_S * figures["chunks_per_s"] * figures["chunk_bytes"]
+    if "router" in figures["processes"]:
+        return worked
+    return worked + relay_cpu(figures["actors"], figures["weights_bytes_per_s"], queries=0)
+
+
+@cache
+def weights_bytes(config: Config) -> int:
+    """Of one publication."""
+    network = QNetwork(config.agent.kind, stack=config.arena.stack, view_px=config.arena.view_px)
+    payload = weights_to_bytes(network, SENT_AS[config.learner.publish_precision])
+    return _size(Weights.of(2**60, 10**5, 10**6, payload))
+
+
+def _payload_s(flow: Flow) -> float:
+    return flow.bytes_per_s * PAYLOAD_S
+
+
+@cache
+def _chunk(config: Config) -> tuple[float, float]:
+    """Bytes and transitions of a chunk, on average."""
+    chunks = episode_chunks(config)
+    return fmean(map(_size, chunks)), fmean(map(len, chunks))
+
+
+Message = (
+    Chunk
+    | EpisodeSummary
+    | InsertReply
+    | Priorities
+    | PrioritiesReply
+    | SampleRequest
+    | Samples
+    | Stats
+    | Weights
+)
+
+
+def _size(message: Message) -> int:
+    return sum(map(len, encode_parts(message)))
+
+
+def _samples(config: Config, size: int) -> Samples:
+    window = config.arena.stack + config.agent.n_step
+    octets, floats = np.ones(size, np.uint8), np.ones(size, np.float32)
+    return Samples(
+        keys=np.full(size, 10**8),
+        probabilities=np.full(size, 1 / size),
+        table_size=config.replay.capacity,
+        total_priority=1.0,
+        actions=octets,
+        rewards=floats,
+        discounts=floats,
+        bootstrap_offsets=octets,
+        weights_versions=np.full(size, 10**5),
+        records=np.zeros((size, window, config.arena.record_bytes), np.uint8),
+    )
+
+
+def _stats() -> Stats:
+    told = {"robot_steps", "episodes", "chunks", "inserts_acknowledged", "spool_chunks"}
+    return Stats(
+        "actor", "actor-100", dict.fromkeys([*told, *NOT_SIMULATED], 1.0), {"incarnation": "1" * 19}
+    )
+
+
+def _episode() -> EpisodeSummary:
+    return EpisodeSummary(
+        actor="actor-100",
+        arena=0,
+        episode=10**5,
+        outcome=Outcome.SUCCESS,
+        frames=EPISODE_FRAMES,
+        score=1.0,
+        collisions=0,
+        epsilon=0.1,
+        weights_version=10**5,
+        mean_q=1.0,
+    )

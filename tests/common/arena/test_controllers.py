@@ -1,0 +1,181 @@
+"""Controllers that see the true state: what each promises, and that all of them mostly succeed."""
+
+import math
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mrcdrl.common.arena import Arena, ArrayPhysics, Scene
+from mrcdrl.common.arena.controllers import CONTROLLERS, SafeCircle, controller, greedy_actions
+from mrcdrl.common.arena.controllers.heading import actions_towards, shortest_assignment
+from mrcdrl.common.arena.world import starts
+from mrcdrl.common.arena.world.obstacles import reachable_px
+from mrcdrl.common.arena.world.rewards import target_distances_px
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.errors import ConfigError
+from mrcdrl.common.messages.trajectory import Float64Array, Outcome
+
+TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])
+
+
+def outcomes(name: str, config: ArenaConfig, episodes: int, epsilon: float = 0) -> list[Outcome]:
+    """Of the paper's test."""
+    rng = np.random.default_rng(0)
+    game = Arena(config, rng, max_collisions=1)
+    ended = []
+    for start in starts.test_starts(config, episodes, seed=0):
+        play = controller(name, config, rng)
+        step = game.reset(start)
+        while not step.last:
+            actions = play(game.scene)
+            explores = rng.random(len(actions)) < epsilon
+            step = game.step(np.where(explores, rng.integers(0, 3, len(actions)), actions))
+        assert step.outcome is not None
+        ended.append(step.outcome)
+    return ended
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_gives_an_action_to_every_robot(name: str) -> None:
+    for num_robots in (1, 3):
+        config = ArenaConfig(num_robots=num_robots)
+        game = Arena(config, np.random.default_rng(0))
+        play = controller(name, config, np.random.default_rng(0))
+        game.reset()
+        for _ in range(5):
+            game.step(play(game.scene))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("clever", "there are random, greedy, potential_field, orca, safe_circle"),
+        ("safe-circle", "did you mean safe_circle"),
+        ("potential", "did you mean potential_field"),
+        ("", "there are random"),
+    ],
+)
+def test_an_unknown_controller_is_refused_with_the_nearest(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        controller(name, ArenaConfig(), np.random.default_rng(0))
+
+
+def test_greedy_goes_to_free_targets() -> None:
+    robots = np.array([[170.0, 100, 0], [180.0, 500, 0]])
+    nearer = greedy_actions(Scene(robots, TARGETS), ArenaConfig())
+    assert nearer.tolist() == [2, 0]  # one to (175, 300), below it; one to (425, 300), above
+
+
+@pytest.mark.parametrize(
+    ("name", "robots", "least"),
+    [("greedy", 2, 0.75), ("potential_field", 4, 0.9), ("orca", 4, 0.9), ("safe_circle", 4, 1.0)],
+)
+def test_a_controller_mostly_succeeds(name: str, robots: int, least: float) -> None:
+    ended = outcomes(name, ArenaConfig(num_robots=robots), 20)
+    assert ended.count(Outcome.SUCCESS) >= 20 * least
+
+
+@pytest.mark.parametrize("layout", ["fixed", "random"])
+def test_safe_circle_never_collides_and_survives_exploration(layout: str) -> None:
+    config = ArenaConfig.model_validate({"num_robots": 6, "target_layout": layout})
+    assert Outcome.COLLISION not in outcomes("safe_circle", config, 5)
+    assert outcomes("safe_circle", config, 5, epsilon=0.01).count(Outcome.COLLISION) <= 1
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), num_robots=st.integers(1, 5), power=st.sampled_from([1, 2]))
+def test_the_assignment_is_the_shortest_of_all(seed: int, num_robots: int, power: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = Scene(rng.uniform(0, 600, (num_robots, 3)), rng.uniform(0, 600, (num_robots, 2)))
+    costs = target_distances_px(scene) ** power
+    every = [costs[np.arange(num_robots), list(p)].sum() for p in permutations(range(num_robots))]
+    chosen = shortest_assignment(scene, power)
+    assert sorted(chosen.tolist()) == list(range(num_robots))
+    assert costs[np.arange(num_robots), chosen].sum() == pytest.approx(min(every))
+
+
+def test_of_squares_the_robot_in_the_way_goes_on() -> None:
+    scene = Scene(
+        np.array([[100.0, 300, 0], [200.0, 300, 0]]), np.array([[210.0, 300], [400, 300]])
+    )
+    assert shortest_assignment(scene, power=2).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("heading", "wanted", "action"),
+    [(0, 0, 1), (0, 0.1, 1), (0, 0.3, 2), (0, -0.3, 0), (3, -3, 2), (-3, 3, 0), (0, 3, 2)],
+)
+def test_the_action_that_turns_nearest(heading: float, wanted: float, action: int) -> None:
+    got = actions_towards(np.array([heading], float), np.array([wanted], float), ArenaConfig())
+    assert got.tolist() == [action]
+
+
+@settings(max_examples=200)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    sides=st.tuples(st.sampled_from([-1, 1]), st.sampled_from([-1, 1])),
+)
+def test_room_is_the_least_gap_of_circling_for_ever(seed: int, sides: tuple[int, int]) -> None:
+    config = ArenaConfig()
+    rng = np.random.default_rng(seed)
+    poses = np.concatenate([rng.uniform(240, 360, (2, 2)), rng.uniform(-4, 4, (2, 1))], axis=1)
+    poses[0, 0] = rng.uniform(0, 240)  # the wall may be nearer than the other
+    room = SafeCircle(config).room(poses[:1], np.array(sides[:1]), poses[1:], np.array(sides[1:]))
+    least = least_gap(config, poses, np.array(sides))
+    assert room[0] <= least + 1e-9
+    if math.dist(poses[0, :2], poses[1, :2]) > 30:  # else one circles within the other
+        assert room[0] == pytest.approx(least, abs=0.2)
+
+
+def least_gap(config: ArenaConfig, poses: Float64Array, sides: Float64Array) -> float:
+    """Of the first robot, by 720 frames of circling."""
+    turns = np.arange(1, 721)[:, None] * sides * math.radians(config.turn_deg)
+    headings = poses[:, 2] + turns
+    ways = config.step_px * np.stack([np.cos(headings), np.sin(headings)], axis=2).cumsum(axis=0)
+    places = np.concatenate([poses[None, :, :2], poses[:, :2] + ways])
+    low, high = reachable_px(config)
+    walls = np.minimum(places[:, 0] - low, high - places[:, 0]).min()
+    apart = np.linalg.norm(places[:, 0] - places[:, 1], axis=1).min()
+    return float(min(walls, apart - 2 * config.robot_radius_px))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"num_obstacles": 3}, {"inner_walls_px": ((300, 200, 300, 400),)}]
+)
+def test_controllers_play_among_obstacles_or_say_that_they_cannot(
+    settings: dict[str, object],
+) -> None:
+    config = ArenaConfig.model_validate({"max_frames": 400, **settings})
+    rng = np.random.default_rng(0)
+    for name in CONTROLLERS:
+        if name in ("orca", "safe_circle"):
+            with pytest.raises(ConfigError, match=f"{name}.* no obstacles"):
+                controller(name, config, rng)
+        else:
+            controller(name, config, rng)
+    with pytest.raises(ConfigError, match=r"safe_circle.* may fail"):
+        controller("safe_circle", ArenaConfig(failure_probability=0.1), rng)
+    game = Arena(config, rng, max_collisions=1)
+    wins = 0
+    for start in starts.test_starts(config, 20, seed=0):
+        play = controller("potential_field", config, rng)
+        step = game.reset(start)
+        while not step.last:
+            step = game.step(play(game.scene))
+        wins += step.outcome is Outcome.SUCCESS
+    assert wins >= 15
+
+
+def test_circling_stays_on_its_circle() -> None:
+    config = ArenaConfig(num_robots=1)
+    physics = ArrayPhysics(config, 1)
+    physics.place(0, np.array([[300.0, 300.0, 0.3]]), np.empty((0, 3)))
+    places = []
+    for _ in range(360):
+        physics.move(np.array([0]), np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.bool_))
+        places.append(physics.robots[0, 0, :2].copy())
+    across = np.ptp(np.array(places), axis=0)
+    assert across == pytest.approx(2 * 6.27, abs=0.05)

@@ -1,0 +1,100 @@
+"""Flags out of the schema, and what is said of those that are none."""
+
+import pytest
+
+from mrcdrl.common.config import load_config, sections
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+
+FIELDS = [(section, name) for section, model in sections().items() for name in model.model_fields]
+
+
+def make_parser() -> Parser:
+    parser = Parser(prog="mrcdrl test")
+    parser.add_argument("--run-dir")
+    add_config_flags(parser)
+    return parser
+
+
+def given(*argv: str) -> dict[str, str]:
+    return overrides(make_parser().parse_args(argv))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """The one line that is said of these arguments."""
+    with pytest.raises(SystemExit) as ended:
+        make_parser().parse_args(argv)
+    assert ended.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_every_field_has_a_flag() -> None:
+    flags = [f"--{section}.{name}={index}" for index, (section, name) in enumerate(FIELDS)]
+    expected = {f"{section}.{name}": str(index) for index, (section, name) in enumerate(FIELDS)}
+    assert given(*flags) == expected
+
+
+def test_the_help_describes_every_field_with_its_default() -> None:
+    text = " ".join(make_parser().format_help().split())
+    for section, name in FIELDS:
+        assert f"--{section}.{name} X" in text
+    assert "gamma X (paper) Default: 0.99" in text
+
+
+def test_flags_may_stand_anywhere() -> None:
+    parser = make_parser()
+    parser.add_argument("figure")
+    parser.add_argument("weights", nargs="*")
+    words = ["comparison", "a", "b"]
+    for flag_at in range(4):
+        argv = [*words[:flag_at], "--agent.kind", "dqn", *words[flag_at:]]
+        parsed = parser.parse_args(argv)
+        assert [parsed.figure, *parsed.weights] == words
+        assert overrides(parsed) == {"agent.kind": "dqn"}
+
+
+def test_only_what_is_given_overrides() -> None:
+    assert given() == {}
+    assert given("--run-dir", "here", "--agent.gamma=0.9", "--arena.collision_reward", "-7") == {
+        "agent.gamma": "0.9",
+        "arena.collision_reward": "-7",
+    }
+
+
+def test_flags_reach_the_configuration() -> None:
+    flags = given("--arena.num_robots", "3", "--agent.kind", "dqn", "--learner.symmetries", "true")
+    config = load_config(None, flags, environ={})
+    assert (config.arena.num_robots, config.agent.kind) == (3, "dqn")
+    assert config.learner.symmetries is True
+
+
+@pytest.mark.parametrize(
+    ("argument", "near"),
+    [
+        ("--arena.num_robot", "--arena.num_robots"),
+        ("--learner.batchsize=64", "--learner.batch_size"),
+        ("--agent.n_steps", "--agent.n_step"),
+        ("--run_dir", "--run-dir"),
+    ],
+)
+def test_an_unknown_flag_is_told_the_nearest(
+    argument: str, near: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refused(capsys, argument)
+    assert f"unknown argument {argument.split('=')[0]}; did you mean {near}?" in line
+    assert "see mrcdrl test --help" in line
+
+
+def test_what_is_like_nothing_is_told_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert refused(capsys, "xyzzy") == "mrcdrl: unknown argument xyzzy (see mrcdrl test --help)\n"
+
+
+def test_there_are_no_abbreviations(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "did you mean --agent.gamma?" in refused(capsys, "--agent.gam", "0.5")
+    assert "did you mean --run-dir?" in refused(capsys, "--run-di", "x")
+
+
+def test_a_flag_without_its_value_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--agent.gamma: expected one argument" in refused(capsys, "--agent.gamma")

@@ -1,0 +1,341 @@
+"""Where a value comes from, what is refused and why, and that the paper's values are its own."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from mrcdrl.common.config import (
+    Config,
+    LearnerConfig,
+    apply_overrides,
+    load_config,
+    load_transport,
+    preset_names,
+    sections,
+    to_toml,
+)
+from mrcdrl.common.errors import ConfigError
+
+FIELDS = [(section, name) for section, model in sections().items() for name in model.model_fields]
+
+
+def load(
+    source: str | None = None,
+    overrides: dict[str, str] | None = None,
+    environ: dict[str, str] | None = None,
+) -> Config:
+    return load_config(source, overrides, environ or {})
+
+
+def refusal(
+    source: str | None = None,
+    overrides: dict[str, str] | None = None,
+    environ: dict[str, str] | None = None,
+) -> str:
+    """The one line that is said of this configuration."""
+    with pytest.raises(ConfigError) as refused:
+        load(source, overrides, environ)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Any:
+    def to_file(text: str, name: str = "mine.toml") -> str:
+        (tmp_path / name).write_text(text, "utf-8")
+        return str(tmp_path / name)
+
+    return to_file
+
+
+def test_a_flag_beats_the_environment_beats_the_file_beats_the_default(write: Any) -> None:
+    source = write("[learner]\nbatch_size = 2\nseed = 2\nthreads = 2\n[replay]\nmin_size = 99\n")
+    environ = {"MRCDRL_LEARNER__BATCH_SIZE": "3", "MRCDRL_LEARNER__SEED": "3", "HOME": "/"}
+    learner = load(source, {"learner.batch_size": "4"}, environ).learner
+    assert (learner.batch_size, learner.seed, learner.threads) == (4, 3, 2)
+    assert learner.publish_period == LearnerConfig().publish_period
+
+
+def test_without_any_source_the_defaults_stand() -> None:
+    assert load() == Config()
+
+
+def test_the_process_environment_is_read_unless_another_is_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MRCDRL_ARENA__NUM_ROBOTS", "4")
+    assert load_config().arena.num_robots == 4
+    assert load_config(environ={}).arena.num_robots == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("arena.num_robots", "3", 3),
+        ("replay.capacity", "100_000", 100_000),
+        ("agent.learning_rate", "3e-4", 3e-4),
+        ("learner.symmetries", "true", True),
+        ("agent.kind", "ddqn", "ddqn"),
+        ("agent.kind", '"ddqn"', "ddqn"),
+        ("learner.device", "cuda:1", "cuda:1"),
+        ("exploration.schedule", "[[0, 1.0], [5, 0.5]]", ((0, 1.0), (5, 0.5))),
+        ("transport.connect", '["tcp/host:1"]', ("tcp/host:1",)),
+    ],
+)
+def test_a_value_in_a_flag_or_the_environment_is_toml_or_plain_text(
+    name: str, text: str, value: object
+) -> None:
+    section, field = name.split(".")
+    variable = f"MRCDRL_{section}__{field}".upper()
+    for config in (load(None, {name: text}), load(None, None, {variable: text})):
+        assert getattr(getattr(config, section), field) == value
+
+
+UNKNOWN = {
+    "section of a file": ("[learners]\nseed = 1", {}, {}, "section 'learners'.*mean learner?"),
+    "field of a file": ("[learner]\nseeds = 1", {}, {}, "'learner.seeds'.*mean learner.seed?"),
+    "field of another": ("[learner]\ngamma = 1", {}, {}, "'learner.gamma'; did you mean"),
+    "section of a flag": (None, {"learners.seed": "1"}, {}, "'learners'.*mean learner?"),
+    "field of a flag": (None, {"agent.n_steps": "1"}, {}, "flag: .*mean agent.n_step?"),
+    "flag without field": (None, {"agent": "1"}, {}, "write SECTION.FIELD"),
+    "environment": (None, {}, {"MRCDRL_AGENT__GAMA": "1"}, "environment: .*mean agent.gamma?"),
+    "value for a section": ("learner = 3", {}, {}, "learner is a section, not a value"),
+    "field outside": ("gamma = 0.9", {}, {}, "unknown section 'gamma'"),
+}
+
+
+@pytest.mark.parametrize("case", UNKNOWN)
+def test_an_unknown_name_is_refused_with_the_nearest_right_one(case: str, write: Any) -> None:
+    text, overrides, environ, reason = UNKNOWN[case]
+    source = None if text is None else write(text)
+    assert re.search(reason, refusal(source, overrides, environ))
+
+
+def test_an_unknown_preset_is_told_which_there_are() -> None:
+    assert refusal("papr").endswith(f"give a file or a preset: {', '.join(preset_names())}")
+
+
+def test_a_file_that_is_no_toml_is_refused(write: Any, tmp_path: Path) -> None:
+    assert "is not TOML" in refusal(write("[learner\n"))
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
+    assert "can't decode" in refusal(str(tmp_path / "bytes.toml"))
+    assert "Is a directory" in refusal(str(tmp_path))
+
+
+def test_a_file_extends_a_preset_field_by_field(write: Any) -> None:
+    source = write('extends = "smoke"\n[replay]\ncapacity = 3000\n')
+    config, smoke = load(source), load("smoke")
+    assert config.replay.capacity == 3000
+    assert config.replay.min_size == smoke.replay.min_size
+    assert config == apply_overrides(smoke.model_dump(), {"replay.capacity": "3000"})
+
+
+def test_a_file_extends_a_file(write: Any) -> None:
+    below = write("[learner]\nseed = 5\nthreads = 5\n[run]\nseed = 5\n", "below.toml")
+    source = write(f'extends = "{below}"\n[learner]\nseed = 6\n')
+    config = load(source)
+    assert (config.learner.seed, config.learner.threads, config.run.seed) == (6, 5, 5)
+
+
+def test_a_file_that_extends_itself_is_refused(write: Any, tmp_path: Path) -> None:
+    source = write(f'extends = "{tmp_path}/mine.toml"')
+    assert "extends itself" in refusal(source)
+    other = write(f'extends = "{source}"', "other.toml")
+    write(f'extends = "{other}"')
+    assert "extends itself" in refusal(source)
+
+
+def test_a_broken_file_below_is_named(write: Any) -> None:
+    below = write("learner = 3", "below.toml")
+    assert "below.toml': learner is a section" in refusal(
+        write(f'extends = "{below}"\n[learner]\nseed = 1')
+    )
+
+
+IMPOSSIBLE = {
+    "value too large": ({"arena.num_robots": "11"}, "arena.num_robots: .*10 .given 11."),
+    "no such choice": ({"agent.kind": "duell"}, "agent.kind: .*'duel', 'ddqn' or 'dqn'"),
+    "not a number": ({"agent.gamma": "nan"}, "agent.gamma: "),
+    "half a robot": ({"arena.num_robots": "2.5"}, "arena.num_robots: .*given 2.5"),
+    "robots as wide as the arena": ({"arena.robot_radius_px": "300"}, "no robot of radius 300"),
+    "a target too few": ({"arena.targets_px": "[[1, 2]]"}, "1 targets for 2 robots; give 2, one a"),
+    "an obstacle without size": ({"arena.obstacles_px": "[[1, 2, 0]]"}, "radius that is not above"),
+    "an inner wall without length": (
+        {"arena.inner_walls_px": "[[1, 2, 1, 2]]"},
+        "a wall without length",
+    ),
+    "a step over an obstacle": (
+        {"arena.num_obstacles": "1", "arena.step_px": "50"},
+        "step_px 50 is not below a robot's width",
+    ),
+    "targets for some robots only": ({"arena.num_targets": "1"}, "leaves 2 robots without"),
+    "counters in poses": ({"arena.kind": "counting"}, 'codec = "frames"'),
+    "a schedule from nowhere": ({"exploration.schedule": "[[5, 1.0]]"}, "rise from 0"),
+    "a schedule going back": ({"exploration.schedule": "[[0, 1], [9, 1], [5, 1]]"}, "rise from 0"),
+    "no schedule": ({"exploration.schedule": "[]"}, "rise from 0"),
+    "epsilon above 1": ({"exploration.schedule": "[[0, 2.0]]"}, "epsilon outside 0 ... 1"),
+    "never sampled": ({"replay.min_size": "500_000"}, "sampling would never start"),
+    "first batch repeats": ({"replay.min_size": "8"}, "first batch would repeat transitions"),
+    **{
+        f"turns {name}": ({"run.turn_size": "64", **overrides}, f"turn_size [0-9]+ .*{reason}")
+        for name, (overrides, reason) in {
+            "of two actors": ({"run.actors": "2"}, "takes one actor"),
+            "of two shards": ({"replay.shards": "2"}, "takes one replay.shards"),
+            "without a log": ({"replay.fsync": "off"}, "takes a log"),
+            "by priorities": ({"replay.sampler": "prioritized"}, "takes replay.sampler"),
+            "of half a frame": ({"run.turn_size": "72"}, "is no multiple of 16, the robots"),
+            "of half a request": ({"learner.batches_per_request": "5"}, "the learner's request"),
+            "without an end": ({"replay.samples_per_insert": "0"}, "the learner's request"),
+            "broken off": ({"run.learner_steps": "40"}, "multiples of 16, and run.learner_steps"),
+            "beyond the table": ({"replay.capacity": "50_050"}, "does not fit in replay.capacity"),
+        }.items()
+    },
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_the_impossible_is_refused_with_its_consequence(case: str) -> None:
+    overrides, reason = IMPOSSIBLE[case]
+    assert re.search(reason, refusal(None, overrides))
+
+
+def test_overrides_of_a_configuration_are_checked_as_a_whole() -> None:
+    smaller = apply_overrides(Config().model_dump(), {"replay.min_size": "64"})
+    assert smaller.replay.min_size == 64
+    with pytest.raises(ConfigError, match="first batch would repeat"):
+        apply_overrides(smaller.model_dump(), {"learner.batch_size": "65"})
+
+
+def test_a_configuration_is_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Config().learner.seed = 1  # type: ignore[misc]
+
+
+def test_every_field_says_where_its_value_is_from() -> None:
+    sourceless = []
+    for section, name in FIELDS:
+        description = sections()[section].model_fields[name].description or ""
+        sources = re.findall(r"\(([^)]*)\)", description)
+        if not any(re.search(r"\b(paper|ancestor|ours|Ape-X)\b", source) for source in sources):
+            sourceless.append(f"{section}.{name}")
+    assert sourceless == []
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_loads_and_reads_back_from_its_toml(name: str, write: Any) -> None:
+    config = load(name)
+    assert load(write(to_toml(config))) == config
+    assert list(tomllib.loads(to_toml(config))) == list(sections())
+
+
+@given(device=st.text(st.characters(codec="utf-8")), points=st.floats(0, 1))
+def test_any_text_and_number_reads_back_from_toml(device: str, points: float) -> None:
+    config = Config.model_validate(
+        {
+            "learner": {"device": device},
+            "exploration": {"schedule": ((0, points), (7, 0.5))},
+            "transport": {"connect": (device, "b")},
+        }
+    )
+    assert Config.model_validate(tomllib.loads(to_toml(config))) == config
+
+
+# The values of sections 3 to 5 of the paper.
+PAPER = {
+    "arena.size_px": 600,
+    "arena.wall_offset_px": 10,
+    "arena.wall_thickness_px": 2,
+    "arena.robot_radius_px": 25,
+    "arena.target_size_px": 30,
+    "arena.turn_deg": 23,
+    "arena.step_px": 2.5,
+    "arena.success_radius_px": 20,
+    "arena.max_collisions": 5,
+    "arena.success_reward": 200,
+    "arena.collision_reward": -5,
+    "arena.step_reward": 0.03,
+    "arena.proximity_weight": 0.7,
+    "arena.view_px": 60,
+    "arena.stack": 4,
+    "arena.renderer": "literal",
+    "agent.kind": "duel",
+    "agent.gamma": 0.99,
+    "agent.n_step": 1,
+    "agent.loss": "squared",
+    "exploration.kind": "schedule",
+    "exploration.schedule": ((0, 1.0), (800_000, 0.1)),
+    "replay.capacity": 400_000,
+    "replay.min_size": 50_000,
+    "learner.batch_size": 32,
+    "evaluator.episodes": 1100,
+    "evaluator.epsilon": 0.01,
+    "run.patience_episodes": 1000,
+}
+
+
+@pytest.mark.parametrize("dotted", PAPER)
+def test_the_preset_paper_is_the_paper(dotted: str) -> None:
+    section, name = dotted.split(".")
+    assert getattr(getattr(load("paper"), section), name) == PAPER[dotted]
+
+
+# Horgan et al. 2018, section 4.1.
+APEX = {
+    "agent.n_step": 3,
+    "agent.learning_rate": 6.25e-5,
+    "agent.target_period": 2500,
+    "exploration.kind": "ladder",
+    "exploration.schedule": ((0, 0.4),),
+    "replay.sampler": "prioritized",
+    "replay.priority_exponent": 0.6,
+    "replay.importance_exponent": 0.4,
+    "replay.importance_exponent_final": 0.4,
+    "learner.batch_size": 512,
+}
+
+
+@pytest.mark.parametrize("dotted", APEX)
+def test_the_preset_apex_is_ape_x(dotted: str) -> None:
+    section, name = dotted.split(".")
+    assert getattr(getattr(load("apex"), section), name) == APEX[dotted]
+
+
+@pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
+def test_the_other_presets_sample_uniformly(preset: str) -> None:
+    assert not load(preset).replay.prioritized
+
+
+def test_the_length_of_a_record_follows_from_the_codec() -> None:
+    assert load(None, {"arena.codec": "frames"}).arena.record_bytes == 3600
+    assert load(None, {"arena.num_robots": "4"}).arena.record_bytes == 80
+
+
+def test_the_way_to_a_run_is_known_before_its_other_settings() -> None:
+    given = {"transport.timeout_s": "2", "learner.batch_size": "64"}
+    assert load_transport(given, environ={}).timeout_s == 2
+    with pytest.raises(ConfigError, match="not below"):
+        load_config(None, given, environ={})
+
+
+def test_a_wrong_way_to_a_run_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"transport\.timeout_s: .*greater than 0"):
+        load_transport({"transport.timeout_s": "-1"}, environ={})
+
+
+def test_the_environment_counts_in_a_service_that_joins() -> None:
+    table = Config().model_dump()
+    environ = {"MRCDRL_LEARNER__THREADS": "3", "MRCDRL_LEARNER__SEED": "4"}
+    joined = apply_overrides(table, {"learner.seed": "5"}, environ)
+    assert (joined.learner.threads, joined.learner.seed) == (3, 5)
+
+
+@pytest.mark.parametrize("name", ["ca", "certificate", "key"])
+def test_certificates_are_given_together(name: str) -> None:
+    with pytest.raises(ConfigError, match="ca, certificate and key are given together"):
+        load_transport({f"transport.{name}": "file.pem"}, environ={})

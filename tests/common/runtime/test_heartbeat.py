@@ -1,0 +1,84 @@
+"""The heartbeat's file, and what is said of it."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Heartbeat, Pulse, main
+
+
+@pytest.mark.parametrize(
+    ("beat_s", "worked_s", "illness"),
+    [
+        (100, 100, None),
+        (71, 71, None),
+        (100, 60, "idle"),
+        (60, 60, "hung"),
+        (60, 20, "hung"),
+    ],
+)
+def test_illness(beat_s: float, worked_s: float, illness: str | None) -> None:
+    found = Pulse(1, beat_s, worked_s).illness(100, 30)
+    assert found == illness or (illness and found and found.startswith(illness))
+
+
+def test_a_beat_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "heartbeat"
+    before_s = time.monotonic()
+    heartbeat = Heartbeat(path)
+    heartbeat.worked()
+    heartbeat.beat()
+    pulse = Pulse.read(path)
+    assert pulse.pid == os.getpid()
+    assert before_s <= pulse.worked_s <= pulse.beat_s <= time.monotonic()
+
+
+def test_work_is_never_taken_back(tmp_path: Path) -> None:
+    heartbeat = Heartbeat(tmp_path / "heartbeat")
+    heartbeat.worked(at_s=5e9)
+    heartbeat.worked(at_s=1.0)
+    heartbeat.beat()
+    assert Pulse.read(tmp_path / "heartbeat").worked_s == 5e9
+
+
+def test_a_folder_that_is_gone_is_no_error(tmp_path: Path) -> None:
+    Heartbeat(tmp_path / "gone" / "heartbeat").beat()
+
+
+def test_without_a_file_named_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(FILE_VARIABLE, raising=False)
+    monkeypatch.chdir(tmp_path)
+    Heartbeat.of_environment().beat()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_heartbeat_is_unhealthy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "heartbeat"))
+    assert main([]) == 1
+    (tmp_path / "heartbeat").write_text("torn")
+    assert main([]) == 1
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "code", "alive"), [(0, 0, True), (60, 1, True), (200, 1, False)]
+)
+def test_what_hangs_is_killed(
+    silent_s: float, code: int, alive: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "heartbeat"
+    monkeypatch.setenv(FILE_VARIABLE, str(path))
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        then_s = time.monotonic() - silent_s
+        path.write_text(f"{process.pid} {then_s} {then_s}")
+        assert main(["--max-age", "30", "--kill-after", "120"]) == code
+        if alive:
+            assert process.poll() is None
+        else:
+            assert process.wait(10) == -9
+        process.kill()

@@ -1,0 +1,280 @@
+"""Memory that a client lends: large messages cross in it, and whatever is odd is refused."""
+
+import mmap
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.errors import DeadlineError, SharedMemoryError, ThrottledError
+from mrcdrl.common.transport import Request, Server, Session, free_endpoint, queries
+from mrcdrl.common.transport.compression import compressed
+from mrcdrl.common.transport.shared_memory import LARGE_BYTES, Lender, Slot, Slots, put, room
+from tests.common.transport.test_transport import until_served
+
+_DEADLINE_S = 20.0
+KEY = "mrcdrl/slots/query"
+LARGE = bytes(range(256)) * (LARGE_BYTES // 128)
+SMALL = b"small"
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="slots are for Linux")
+
+
+def test_two_ends_see_the_same_memory() -> None:
+    slot = Slot(1000)
+    memory = Slots().open(slot.address)
+    assert len(memory) == len(slot.memory) >= 1000
+    memory[10:15] = b"hello"
+    assert slot.memory[10:15] == b"hello"
+    slot.memory[10] = ord("j")
+    assert memory[10:15] == b"jello"
+
+
+def test_memory_begins_at_a_multiple_of_64() -> None:
+    address: int = np.frombuffer(Slot(1).memory, np.uint8).__array_interface__["data"][0]
+    assert address % 64 == 0
+
+
+def open_descriptors() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+def test_nothing_is_left_of_a_slot() -> None:
+    before = open_descriptors()
+    for _ in range(20):
+        slot, slots = Slot(1 << 20), Slots()
+        slots.open(slot.address)
+        del slot, slots
+    assert open_descriptors() == before
+
+
+def test_the_slots_of_many_clients_are_mapped_once() -> None:
+    slots, lent = Slots(), [Slot(10) for _ in range(100)]
+    mapped = [slots.open(slot.address) for slot in lent]
+    assert all(slots.open(s.address) is m for s, m in zip(lent, mapped, strict=True))
+
+
+def test_slots_of_the_dead_are_forgotten() -> None:
+    slots, slot, other = Slots(), Slot(10), Slot(10)
+    first = slot.address
+    slots.open(first)
+    del slot
+    slots.open(other.address)
+    with pytest.raises(SharedMemoryError):
+        slots.open(first)
+
+
+def foreign(slot: Slot, **parts: str) -> str:
+    names = ("boot", "process", "descriptor", "token")
+    fields = dict(zip(names, slot.address.split(), strict=True)) | parts
+    return " ".join(fields[name] for name in names)
+
+
+ODD = {
+    "nonsense": (lambda _: "x", "no address"),
+    "a path": (lambda s: foreign(s, process="../1"), "no address"),
+    "another host": (lambda s: foreign(s, boot="0" * 36), "another host"),
+    "no process": (lambda s: foreign(s, process="4194999999"), "container or user"),
+    "no descriptor": (lambda s: foreign(s, descriptor="99999"), "container or user"),
+    "standard input": (lambda s: foreign(s, descriptor="0"), "container or user"),
+    "another token": (lambda s: foreign(s, token="0" * 32), "another process"),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_an_odd_address_is_refused(name: str) -> None:
+    change, reason = ODD[name]
+    slot = Slot(10)
+    with pytest.raises(SharedMemoryError, match=reason):
+        Slots().open(change(slot))
+
+
+def test_memory_that_could_shrink_under_its_reader_is_refused() -> None:
+    descriptor = os.memfd_create("mrcdrl-slot", os.MFD_ALLOW_SEALING)
+    try:
+        os.ftruncate(descriptor, mmap.PAGESIZE)
+        unsealed = foreign(Slot(10), descriptor=str(descriptor))
+        with pytest.raises(SharedMemoryError, match="no sealed memory"):
+            Slots().open(unsealed)
+    finally:
+        os.close(descriptor)
+
+
+def test_a_message_is_put_around_what_lies_there_already() -> None:
+    memory = Slot(1000).memory
+    last = room(memory, 300)
+    assert last is not None
+    last[:] = b"z" * 300
+    place = put(memory, [b"abc", last])
+    assert place is not None
+    start, length = place
+    assert bytes(memory[start : start + length]) == b"abc" + b"z" * 300
+    assert np.shares_memory(np.frombuffer(memory, np.uint8), np.frombuffer(last, np.uint8))
+
+
+def test_what_does_not_fit_is_not_put() -> None:
+    memory = Slot(1000).memory
+    assert put(memory, [bytes(len(memory) + 1)]) is None
+    assert room(memory, len(memory) + 1) is None
+    everything = room(memory, len(memory))
+    assert everything is not None
+    assert put(memory, [b"no room before", everything]) is None
+
+
+class Pair:
+    """A client and a server across a router, and a thread that serves."""
+
+    def __init__(self, server_session: Session, client_session: Session) -> None:
+        self.server: Server = server_session.server(KEY)
+        until_served(client_session, KEY, self.server)
+        self.client = client_session.client(KEY, "the peer", lends=True)
+        self.lender: Lender = self.client._lender
+        self.thread = ThreadPoolExecutor(1)
+
+    def exchange(self, request: bytes, reply: bytes) -> tuple[bytes, bytes, Request]:
+        """What the server and the client got."""
+        taken = self.thread.submit(self.server.take, _DEADLINE_S)
+        pending = self.client.ask(request, reply_bytes=len(reply))
+        asked = taken.result()
+        assert asked is not None
+        got = bytes(asked.payload)
+        asked.reply(reply)
+        answer = bytes(pending.result())
+        pending.release()
+        return got, answer, asked
+
+
+@pytest.fixture
+def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
+    endpoint = free_endpoint()
+    shared = getattr(request, "param", True)
+    with (
+        Session(TransportConfig(listen=(endpoint,))) as router,
+        Session(TransportConfig(connect=(endpoint,), shared_memory=shared)) as client,
+    ):
+        opened = Pair(router, client)
+        yield opened
+        opened.thread.shutdown()
+
+
+def test_the_first_exchange_tells_whether_memory_is_shared(
+    pair: Pair, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    got, answer, _ = pair.exchange(SMALL, SMALL)
+    assert (got, answer) == (SMALL, SMALL)
+    assert pair.lender.near is True
+    assert caplog.messages == ["large messages to and from the peer go through shared memory"]
+
+
+def test_large_messages_go_through_one_slot_both_ways(pair: Pair) -> None:
+    pair.exchange(SMALL, SMALL)
+    descriptors = set()
+    for _ in range(5):
+        got, answer, asked = pair.exchange(LARGE, LARGE[::-1])
+        assert (got, answer) == (LARGE, LARGE[::-1])
+        assert isinstance(asked.payload, memoryview)
+        descriptors.add(open_descriptors())
+    assert len(descriptors) == 1
+
+
+@pytest.mark.parametrize("pair", [False], indirect=True)
+def test_where_it_is_switched_off_all_goes_over_the_network(pair: Pair) -> None:
+    for _ in range(2):
+        got, answer, asked = pair.exchange(LARGE, LARGE)
+        assert (got, answer) == (LARGE, LARGE)
+        assert isinstance(asked.payload, bytes)
+
+
+def test_a_peer_that_cannot_open_a_slot_is_served_over_the_network(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    monkeypatch.setattr(
+        "mrcdrl.common.transport.shared_memory._boot_id", iter(["0" * 36, *["1" * 36] * 9]).__next__
+    )
+    sent: list[bytes] = []
+    monkeypatch.setattr(
+        queries, "compressed", lambda parts: sent.append(compressed(parts)) or sent[-1]
+    )
+    for _ in range(3):
+        got, answer, asked = pair.exchange(LARGE, LARGE)
+        assert (got, answer) == (LARGE, LARGE)
+        assert isinstance(asked.payload, bytes)
+    assert len(sent) == 5  # all but the first request, before which nothing is known
+    assert max(map(len, sent)) < len(LARGE) / 10
+    assert caplog.messages == [
+        "large messages to and from the peer go over the network: another host"
+    ]
+
+
+def test_a_slot_that_is_out_of_reach_later_makes_the_client_ask_over_the_network(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair.exchange(SMALL, SMALL)
+    with monkeypatch.context() as patched:
+        patched.setattr("mrcdrl.common.transport.shared_memory._is_slot", lambda _: False)
+        pair.server._slots = Slots()
+        taken = pair.thread.submit(pair.server.take, _DEADLINE_S)
+        pending = pair.client.ask(LARGE)
+        assert taken.result() is None
+        with pytest.raises(ThrottledError, match="another container or user"):
+            pending.result()
+    got, answer, asked = pair.exchange(LARGE, LARGE)
+    assert (got, answer) == (LARGE, LARGE)
+    assert isinstance(asked.payload, bytes)
+
+
+def test_a_slot_whose_answer_did_not_come_is_not_used_again(pair: Pair) -> None:
+    pair.exchange(SMALL, SMALL)
+    pair.client._timeout_s = -0.9  # of our own wait: at once, whatever Zenoh does
+    silent = pair.client.ask(LARGE)
+    with pytest.raises(DeadlineError):
+        silent.result()
+    silent.release()
+    late = pair.server.take(_DEADLINE_S)
+    assert late is not None
+    pair.client._timeout_s = _DEADLINE_S
+    got, answer, _ = pair.exchange(LARGE[::-1], LARGE)
+    assert bytes(late.payload) == LARGE
+    assert (got, answer) == (LARGE[::-1], LARGE)
+
+
+OTHER_PROCESS = f"""
+import sys
+from common.config import TransportConfig
+from common.transport import Session
+with Session(TransportConfig(connect=(sys.argv[1],))) as session:
+    client = session.client({KEY!r}, "the peer", lends=True)
+    for _ in range(3):
+        pending = client.ask(bytes(range(256)) * 1000, reply_bytes=256_000)
+        print(bytes(pending.result())[::-1] == bytes(range(256)) * 1000)
+        pending.release()
+"""
+
+
+def test_two_processes_share_memory() -> None:
+    endpoint = free_endpoint()
+    with Session(TransportConfig(listen=(endpoint,))) as session:
+        server = session.server(KEY)
+        with subprocess.Popen(
+            [sys.executable, "-c", OTHER_PROCESS, endpoint],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
+            payloads = []
+            for _ in range(3):
+                request = server.take(60.0)
+                assert request is not None
+                payloads.append(request.payload)
+                request.reply(bytes(request.payload)[::-1])
+            out, err = process.communicate(timeout=60)
+    assert (out, process.returncode) == ("True\n" * 3, 0), err
+    assert [type(payload) for payload in payloads] == [bytes, memoryview, memoryview]

@@ -1,0 +1,550 @@
+"""Real Zenoh sessions on loopback: every wait ends, every queue's end is as stated."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.errors import (
+    ConfigError,
+    DeadlineError,
+    EndpointError,
+    RefusedError,
+    ThrottledError,
+)
+from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.weights import WeightsReader, WeightsWriter
+from mrcdrl.common.transport import ROUTER_FILE, Client, Publisher, Server, Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+
+_DEADLINE_S = 20.0
+KEY = "mrcdrl/test/query"
+KEYS = Keys("test")
+
+
+class Network:
+    """Opens sessions of one router."""
+
+    def __init__(self, endpoint: str, max_message_bytes: int) -> None:
+        self.endpoint = endpoint
+        self._max_bytes = max_message_bytes
+        self._sessions: list[Session] = []
+
+    def join(self) -> Session:
+        config = TransportConfig(
+            connect=(self.endpoint,), max_message_bytes=self._max_bytes, timeout_s=5.0
+        )
+        session = Session(config)
+        self._sessions.append(session)
+        return session
+
+    def pair(self, *, capacity: int = 256, timeout_s: float = 5.0) -> tuple[Server, Client]:
+        """A server, and a client that reaches it already."""
+        self.server_session, session = self.join(), self.join()
+        server = self.server_session.server(KEY, capacity)
+        until_served(session, KEY, server)
+        return server, session.client(KEY, "the peer", timeout_s)
+
+    def close(self) -> None:
+        for session in reversed(self._sessions):
+            session.close()
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    """The endpoint of a router that all tests here share."""
+    endpoint = free_endpoint()
+    with Session(TransportConfig(listen=(endpoint,))):
+        yield endpoint
+
+
+@pytest.fixture
+def network(router: str) -> Iterator[Network]:
+    opened = Network(router, 1 << 20)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def small_network(router: str) -> Iterator[Network]:
+    opened = Network(router, 1000)
+    yield opened
+    opened.close()
+
+
+def until_served(session: Session, key: str, server: Server) -> None:
+    """Wait until queries of the session reach the server: declarations travel, too."""
+    probe = session.client(key, "the server")
+    deadline = time.monotonic() + _DEADLINE_S
+    while True:
+        probe.ask(b"probe")
+        request = server.take(0.2)
+        if request is not None:
+            break
+        assert time.monotonic() < deadline, "no query arrived"
+    while request is not None:  # those that were late
+        request.reply(b"")
+        request = server.take(0.1)
+
+
+def eventually(found: Callable[[], object]) -> None:
+    """Wait, without polling blindly, until it is so; fails at the deadline."""
+    waiter, deadline = threading.Event(), time.monotonic() + _DEADLINE_S
+    while not found():
+        assert time.monotonic() < deadline, "did not happen"
+        waiter.wait(0.01)
+
+
+def answer_next(server: Server, answer: str, text: str) -> bytes:
+    """Take one request, answer it by `reply`, `refuse` or `hold`, and return its payload."""
+    request = server.take(_DEADLINE_S)
+    assert request is not None
+    if answer == "reply":
+        request.reply(text.encode())
+    elif answer == "refuse":
+        request.refuse(text)
+    else:
+        request.throttle(text)
+    return request.payload
+
+
+def test_a_query_is_answered_across_the_router(network: Network) -> None:
+    server, client = network.pair()
+    with ThreadPoolExecutor(1) as other:
+        taken = other.submit(answer_next, server, "reply", "back")
+        assert client.ask(b"there").result() == b"back"
+        assert taken.result() == b"there"
+
+
+def test_several_queries_may_be_under_way(network: Network) -> None:
+    server, client = network.pair()
+    pending = [client.ask(str(number).encode()) for number in range(5)]
+    requests = [server.take(_DEADLINE_S) for _ in pending]
+    for request in reversed(requests):
+        assert request is not None
+        request.reply(request.payload * 2)
+    assert [reply.result() for reply in pending] == [b"00", b"11", b"22", b"33", b"44"]
+
+
+def test_a_refusal_brings_its_reason(network: Network) -> None:
+    server, client = network.pair()
+    with ThreadPoolExecutor(1) as other:
+        other.submit(answer_next, server, "refuse", "wrong arena")
+        with pytest.raises(RefusedError, match=r"^the peer refused: wrong arena$") as refused:
+            client.ask(b"").result()
+    assert not isinstance(refused.value, ThrottledError)
+
+
+def test_a_held_request_is_told_from_a_refused_one(network: Network) -> None:
+    server, client = network.pair()
+    with ThreadPoolExecutor(1) as other:
+        other.submit(answer_next, server, "hold", "not yet")
+        with pytest.raises(ThrottledError, match=r"^not yet$"):
+            client.ask(b"").result()
+
+
+def test_where_nobody_serves_the_answer_is_at_once_a_deadline_error(network: Network) -> None:
+    client = network.join().client(KEY, "the peer", timeout_s=15.0)
+    before = time.monotonic()
+    with pytest.raises(DeadlineError, match="no answer from the peer"):
+        client.ask(b"").result()
+    assert time.monotonic() - before < 10.0
+
+
+def test_a_silent_peer_is_given_up_at_the_timeout(network: Network) -> None:
+    server, client = network.pair(timeout_s=0.3)
+    before = time.monotonic()
+    pending = client.ask(b"")
+    request = server.take(_DEADLINE_S)
+    assert request is not None
+    with pytest.raises(DeadlineError, match="no answer from the peer in time"):
+        pending.result()
+    assert 0.2 < time.monotonic() - before < 10.0
+    request.reply(b"too late")  # disturbs nobody
+
+
+def test_a_peer_that_leaves_is_given_up(network: Network) -> None:
+    server, client = network.pair(timeout_s=2.0)
+    pending = client.ask(b"")
+    request = server.take(_DEADLINE_S)
+    assert request is not None
+    network.server_session.close()
+    with pytest.raises(DeadlineError, match="no answer from the peer"):
+        pending.result()
+
+
+def test_a_request_that_is_too_large_is_refused(small_network: Network) -> None:
+    server, client = small_network.pair()
+    with pytest.raises(RefusedError, match="1001 bytes exceed the limit of 1000"):
+        client.ask(b"x" * 1001).result()
+    assert server.refused == 1
+    assert server.take(0.01) is None
+
+
+def test_an_answer_that_is_too_large_is_refused(small_network: Network) -> None:
+    server, client = small_network.pair()
+    with ThreadPoolExecutor(1) as other:
+        other.submit(answer_next, server, "reply", "x" * 1001)
+        with pytest.raises(RefusedError, match="the answer of the peer exceeds 1000 bytes"):
+            client.ask(b"").result()
+
+
+def test_a_full_server_holds_further_requests(network: Network) -> None:
+    server, client = network.pair(capacity=1)
+    first = client.ask(b"first")
+    with pytest.raises(ThrottledError, match="1 requests are waiting"):
+        client.ask(b"second").result()
+    assert (server.throttled, server.refused) == (1, 0)
+    assert answer_next(server, "reply", "done") == b"first"
+    assert first.result() == b"done"
+
+
+def test_large_requests_that_wait_are_held_to_four_of_the_largest(small_network: Network) -> None:
+    server = small_network.join().server(KEY)
+    client = small_network.join().client(KEY, "the peer")
+    waiting = [client.ask(b"x" * 900) for _ in range(4)]
+    with pytest.raises(ThrottledError, match="4 requests are waiting"):
+        client.ask(b"x" * 900).result()
+    for request in waiting:
+        answer_next(server, "reply", "done")
+        assert request.result() == b"done"
+    last = client.ask(b"x" * 900)
+    answer_next(server, "reply", "done")
+    assert last.result() == b"done"
+
+
+def payload_of(item: tuple[str, bytes] | None) -> bytes | None:
+    return None if item is None else item[1]
+
+
+def until_known(publisher: Publisher, take: Callable[[float], bytes | None]) -> None:
+    """Publish until the subscription is known over there: what is put before is lost."""
+    while take(0.1) is None:
+        publisher.put(b"early")
+    publisher.put(b"known")
+    while take(_DEADLINE_S) != b"known":
+        pass
+
+
+def test_the_latest_subscriber_keeps_the_newest_only(network: Network) -> None:
+    session, other = network.join(), network.join()
+    subscriber = session.latest_subscriber(KEY)
+    marks = session.queue_subscriber("mrcdrl/test/mark")
+    publisher, marker = other.publisher(KEY), other.publisher("mrcdrl/test/mark")
+    until_known(publisher, subscriber.take)
+    until_known(marker, lambda timeout_s: payload_of(marks.take(timeout_s)))
+    for number in range(100):
+        publisher.put(str(number).encode())
+    marker.put(b"end")
+    while marks.take(_DEADLINE_S) != ("mrcdrl/test/mark", b"end"):  # then all before it have come
+        pass
+    assert subscriber.take() == b"99"
+    assert subscriber.take() is None
+    assert subscriber.take(0.01) is None
+
+
+def test_the_queue_keeps_the_order_and_counts_what_it_drops(network: Network) -> None:
+    subscriber = network.join().queue_subscriber("mrcdrl/test/queue/*", capacity=10)
+    session = network.join()
+    publisher = session.publisher("mrcdrl/test/queue/a")
+    until_known(publisher, lambda timeout_s: payload_of(subscriber.take(timeout_s)))
+    for number in range(25):
+        publisher.put(bytes([number]))
+    eventually(lambda: subscriber.dropped == 15)
+    assert list(subscriber.drain()) == [("mrcdrl/test/queue/a", bytes([n])) for n in range(10)]
+    publisher.put(b"later")
+    assert subscriber.take(_DEADLINE_S) == ("mrcdrl/test/queue/a", b"later")
+    assert subscriber.take(0.0) is None
+    assert subscriber.take(0.01) is None
+
+
+def test_a_publication_that_is_too_large_is_counted_and_dropped(small_network: Network) -> None:
+    latest = small_network.join().latest_subscriber(KEY)
+    waiting = small_network.join().queue_subscriber(KEY)
+    publisher = small_network.join().publisher(KEY)
+    until_known(publisher, latest.take)
+    until_known(publisher, lambda timeout_s: payload_of(waiting.take(timeout_s)))
+    publisher.put(b"ready")
+    while waiting.take(_DEADLINE_S) != (KEY, b"ready"):
+        pass
+    publisher.put(b"x" * 1001)
+    publisher.put(b"x" * 1000)
+    assert waiting.take(_DEADLINE_S) == (KEY, b"x" * 1000)
+    eventually(lambda: latest.take(0.1) == b"x" * 1000)
+    assert (waiting.dropped, latest.oversized) == (1, 1)
+
+
+def test_presence_sees_who_is_there_already_who_comes_and_who_goes(network: Network) -> None:
+    first, second = KEYS.live("actor", "actor-0"), KEYS.live("actor", "actor-1")
+    network.join().announce(first)
+    presence = network.join().presence(KEYS.everyone("actor"))
+    eventually(lambda: presence.alive() == {first})
+    leaver = network.join()
+    leaver.announce(second)
+    network.join().announce(KEYS.live("learner", "learner-0"))
+    eventually(lambda: presence.alive() == {first, second})
+    leaver.close()
+    eventually(lambda: presence.alive() == {first})
+    assert list(presence.changes()) == []
+
+
+def weights(epoch: int, version: int) -> Weights:
+    return Weights.of(epoch, version, learner_step=10 * version, payload=b"p" * 100)
+
+
+@pytest.fixture
+def writer(network: Network) -> Iterator[WeightsWriter]:
+    opened = WeightsWriter(network.join(), KEYS)
+    yield opened
+    opened.close()
+
+
+def test_who_joins_late_gets_the_newest_weights_soon(
+    network: Network, writer: WeightsWriter
+) -> None:
+    for version in range(3):
+        writer.publish(weights(0, version))
+    reader = WeightsReader(network.join(), KEYS)
+    before = time.monotonic()
+    assert reader.wait(StopSignal()) == weights(0, 2)
+    assert time.monotonic() - before < 1.0
+
+
+def test_who_waits_gets_the_first_weights(network: Network, writer: WeightsWriter) -> None:
+    reader = WeightsReader(network.join(), KEYS)
+    with ThreadPoolExecutor(1) as other:
+        waiting = other.submit(reader.wait, StopSignal())
+        writer.publish(weights(0, 0))
+        assert waiting.result(_DEADLINE_S) == weights(0, 0)
+
+
+def test_waiting_for_weights_ends_when_stopped(network: Network) -> None:
+    reader, stop = WeightsReader(network.join(), KEYS), StopSignal()
+    with ThreadPoolExecutor(1) as other:
+        waiting = other.submit(reader.wait, stop)
+        stop.set()
+        assert waiting.result(_DEADLINE_S) is None
+
+
+@pytest.mark.parametrize("older", [weights(1, 4), weights(1, 5), weights(0, 9)])
+def test_weights_never_go_back(network: Network, writer: WeightsWriter, older: Weights) -> None:
+    reader = WeightsReader(network.join(), KEYS)
+    writer.publish(weights(1, 5))
+    assert reader.wait(StopSignal()) == weights(1, 5)
+    reader.latest(0.2)  # the same, by the subscription
+    writer.publish(older)
+    assert reader.latest(0.2) is None
+    writer.publish(weights(2, 0))
+    assert reader.latest(_DEADLINE_S) == weights(2, 0)
+
+
+def test_foreign_weights_are_counted_and_dropped(network: Network, writer: WeightsWriter) -> None:
+    reader = WeightsReader(network.join(), KEYS)
+    publisher = network.join().publisher(KEYS.weights)
+    publisher.put(b"nonsense")
+    eventually(lambda: reader.latest(0.1) is None and reader.refused == 1)
+    writer.publish(weights(0, 1))
+    assert reader.latest(_DEADLINE_S) == weights(0, 1)
+
+
+def test_a_port_in_use_is_one_line(network: Network) -> None:
+    with pytest.raises(EndpointError, match=r"cannot listen on tcp/127.0.0.1:.* in use") as refused:
+        Session(TransportConfig(listen=(network.endpoint,)))
+    assert "\n" not in str(refused.value)
+
+
+def test_nobody_at_the_endpoint_is_one_line() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(EndpointError, match=f"nobody answers at {endpoint}") as refused:
+        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=0.0)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("side", "endpoint"),
+    [
+        ("listen", "nonsense"),
+        ("listen", "tcp/127.0.0.1"),
+        ("listen", "carrier-pigeon/1:2"),
+        ("connect", "nonsense"),
+    ],
+)
+def test_an_endpoint_that_is_none_is_refused(side: str, endpoint: str) -> None:
+    with pytest.raises(EndpointError, match=endpoint):
+        Session(TransportConfig.model_validate({side: (endpoint,)}), open_timeout_s=0.0)
+
+
+def test_without_an_endpoint_nothing_is_opened() -> None:
+    with pytest.raises(EndpointError, match="give --connect or --listen"):
+        Session(TransportConfig())
+
+
+def test_the_with_block_leaves_neither_session_nor_thread_nor_port() -> None:
+    before = set(threading.enumerate())
+    endpoint = free_endpoint()
+    with (
+        Session(TransportConfig(listen=(endpoint,))) as router,
+        Session(TransportConfig(connect=(endpoint,))) as peer,
+    ):
+        assert "open" in repr(router)
+        router.server(KEY)
+        router.latest_subscriber(KEY)
+        peer.queue_subscriber(KEY)
+        peer.publisher(KEY).put(b"x")
+        peer.presence(KEYS.everyone())
+        peer.announce(KEYS.live("actor", "a"))
+        writer = WeightsWriter(peer, KEYS)
+        writer.close()
+    assert "closed" in repr(router)
+    assert "closed" in repr(peer)
+    router.close()  # again is harmless
+    assert set(threading.enumerate()) <= before
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((host, int(port)), timeout=1.0)
+
+
+def test_a_free_endpoint_is_free() -> None:
+    with Session(TransportConfig(listen=(free_endpoint(),))) as session:
+        assert "open" in repr(session)
+
+
+def test_a_router_is_of_use_before_the_one_it_links_to_and_links_again_to_each_that_comes() -> None:
+    near, far = free_endpoint(), free_endpoint()
+    with (
+        Session(TransportConfig(listen=(near,), connect=(far,))),
+        Session(TransportConfig(connect=(near,))) as serving,
+        Session(TransportConfig(connect=(near,))) as neighbour,
+    ):
+        server = serving.server(KEY)
+        until_served(neighbour, KEY, server)
+        for _ in range(2):
+            with (
+                Session(TransportConfig(listen=(far,))),
+                Session(TransportConfig(connect=(far,))) as distant,
+            ):
+                until_served(distant, KEY, server)
+
+
+@pytest.mark.parametrize("endpoint", ["tcp", "127.0.0.1:7447", "tcp/", ""])
+def test_a_malformed_endpoint_is_refused_at_once(endpoint: str) -> None:
+    with pytest.raises(EndpointError, match="is no endpoint"):
+        Session(TransportConfig(connect=(endpoint,)))
+
+
+def test_an_encrypted_endpoint_needs_certificates() -> None:
+    with pytest.raises(EndpointError, match=r"needs transport\.ca, transport\.certificate and"):
+        Session(TransportConfig(connect=("tls/127.0.0.1:7447",)), open_timeout_s=0.0)
+
+
+@pytest.mark.parametrize("side", ["listen", "connect"])
+def test_who_has_certificates_speaks_in_the_clear_to_nobody(certificates: Path, side: str) -> None:
+    files = {"ca": "ca.pem", "certificate": "certificate.pem", "key": "key.pem"}
+    given = {name: str(certificates / "router" / file) for name, file in files.items()}
+    config = TransportConfig.model_validate({side: ("tcp/127.0.0.1:7447",), **given})
+    with pytest.raises(EndpointError, match=r"is not encrypted, .* write tls/127\.0\.0\.1:7447"):
+        Session(config, open_timeout_s=0.0)
+
+
+def test_a_certificate_that_is_not_there_is_named(certificates: Path) -> None:
+    config = TransportConfig(
+        connect=("tls/127.0.0.1:7447",),
+        ca=str(certificates / "actor" / "ca.pem"),
+        certificate=str(certificates / "actor" / "certificate.pem"),
+        key=str(certificates / "nobody" / "key.pem"),
+    )
+    with pytest.raises(EndpointError, match=r"transport\.key .*nobody.*: No such file"):
+        Session(config, open_timeout_s=0.0)
+
+
+@pytest.mark.parametrize(
+    ("host", "level", "said"),
+    [("127.0.0.1", "INFO", "for this machine only"), ("0.0.0.0", "WARNING", "whoever reaches it")],
+)
+def test_who_listens_in_the_clear_says_so(
+    caplog: pytest.LogCaptureFixture, host: str, level: str, said: str
+) -> None:
+    endpoint = free_endpoint().replace("127.0.0.1", host)
+    with caplog.at_level("INFO"), Session(TransportConfig(listen=(endpoint,))):
+        [record] = [r for r in caplog.records if r.name == "transport"]
+    assert record.levelname == level
+    assert said in record.message
+
+
+def test_a_router_listens_where_its_file_says(tmp_path: Path) -> None:
+    endpoint, file = free_endpoint(), tmp_path / "router.json5"
+    file.write_text(ROUTER_FILE.read_text().replace("tcp/127.0.0.1:7447", endpoint))
+    with (
+        Session(TransportConfig(), router_file=file),
+        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=_DEADLINE_S) as peer,
+    ):
+        assert "open" in repr(peer)
+
+
+@pytest.mark.parametrize("content", ["{mode: ", '{mode: "wanderer"}', "{nonsense: 1}"])
+def test_a_bad_router_file_is_one_line(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "router.json5"
+    file.write_text(content)
+    with pytest.raises(ConfigError, match=r"router\.json5") as refused:
+        Session(TransportConfig(), router_file=file)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(ConfigError, match="No such file"):
+        Session(TransportConfig(), router_file=tmp_path / "none.json5")
+
+
+def test_a_linked_router_waits_for_the_other() -> None:
+    """Started in either order, they link."""
+    first, second = free_endpoint(), free_endpoint()
+    with Session(TransportConfig(listen=(second,), connect=(first,))) as router:
+        server = router.server(KEY)
+        with (
+            Session(TransportConfig(listen=(first,))),
+            Session(TransportConfig(connect=(first,))) as peer,
+        ):
+            until_served(peer, KEY, server)
+
+
+def test_a_client_whose_link_was_lost_goes_on_as_another() -> None:
+    """With all that it declared; a router may still clear away what the old link left."""
+    endpoint = free_endpoint()
+    router = Session(TransportConfig(listen=(endpoint,)))
+    config = TransportConfig(connect=(endpoint,), timeout_s=5.0)
+    with Session(config) as one, Session(config) as other:
+        server, client = one.server(KEY), other.client(KEY, "the peer")
+        latest, queue = one.latest_subscriber("test/latest"), one.queue_subscriber("test/queue")
+        publishers = other.publisher("test/latest"), other.publisher("test/queue")
+        one.announce(KEYS.live("actor", "a"))
+        presence = other.presence(KEYS.everyone())
+        until_served(other, KEY, server)
+        identities = one._session.zid(), other._session.zid()
+        router.close()
+        with Session(TransportConfig(listen=(endpoint,))):
+            eventually(lambda: (one._session.zid(), other._session.zid()) != identities)
+            until_served(other, KEY, server)
+            assert one._session.zid() != identities[0]
+            assert other._session.zid() != identities[1]
+            pending = client.ask(b"question")
+            assert answer_next(server, "reply", "answer") == b"question"
+            assert pending.result() == b"answer"
+            for publisher, subscriber in zip(publishers, (latest, queue), strict=True):
+                publisher.put(b"news")
+                assert subscriber.take(_DEADLINE_S) is not None
+            eventually(lambda: KEYS.live("actor", "a") in presence.alive())
+
+
+def test_closing_waits_for_no_router() -> None:
+    endpoint = free_endpoint()
+    router = Session(TransportConfig(listen=(endpoint,)))
+    session = Session(TransportConfig(connect=(endpoint,)))
+    session.server(KEY)
+    router.close()
+    began_s = time.monotonic()
+    session.close()
+    assert time.monotonic() - began_s < _DEADLINE_S
+    assert "closed" in repr(session)

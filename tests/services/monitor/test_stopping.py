@@ -1,0 +1,72 @@
+"""The stop rules, as a table of runs."""
+
+import pytest
+
+from mrcdrl.common.config import RunConfig
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
+from mrcdrl.services.monitor.stopping import StoppingRule
+
+WON, LOST = Outcome.SUCCESS, Outcome.COLLISION
+
+
+def episode(outcome: Outcome) -> EpisodeSummary:
+    return EpisodeSummary("actor-0", 0, 0, outcome, 100, 150.0, 1, 0.1, 5, 2.0)
+
+
+def evaluation(rate: float) -> Evaluation:
+    return Evaluation(
+        "0", 1, 1, 100, 2, 100, rate, 1 - rate, 0.0, (0.0, 1.0), 1.0, 1.0, 1.0, 1.0, 1.0, 1, 1.0
+    )
+
+
+def stopped_after(run: RunConfig, outcomes: list[Outcome]) -> int | None:
+    """Episodes after which the rule first speaks."""
+    rule = StoppingRule(run)
+    for count, outcome in enumerate(outcomes, 1):
+        rule.observe_episode(episode(outcome))
+        if rule.reason(0, 0.0) is not None:
+            return count
+    return None
+
+
+@pytest.mark.parametrize(
+    ("patience", "floor", "outcomes", "expected"),
+    [
+        (300, 0.5, [WON] * 60 + [LOST] * 1_000, 100 + 300),
+        (300, 0.5, [WON] * 40 + [LOST] * 1_000, None),  # a certain size is not satisfied
+        (300, 0.0, [LOST] * 1_000, 100 + 300),
+        (0, 0.5, [WON] * 60 + [LOST] * 5_000, None),
+        (300, 0.5, [WON] * 60 + [LOST] * 200 + [WON] * 100 + [LOST] * 1_000, 360 + 300),
+        (300, 0.5, [WON] * 99, None),
+        (50, 0.5, [WON] * 149, None),
+        (50, 0.5, [WON] * 150, 150),
+    ],
+)
+def test_patience(
+    patience: int, floor: float, outcomes: list[Outcome], expected: int | None
+) -> None:
+    run = RunConfig(patience_episodes=patience, patience_floor=floor)
+    assert stopped_after(run, outcomes) == expected
+
+
+@pytest.mark.parametrize(
+    ("run", "steps", "minutes", "rates", "expected"),
+    [
+        (RunConfig(minutes=10), 0, 9.9, [], None),
+        (RunConfig(minutes=10), 0, 10.0, [], "run.minutes 10 over"),
+        (RunConfig(learner_steps=500), 499, 0.0, [], None),
+        (RunConfig(learner_steps=500), 500, 0.0, [], "run.learner_steps 500 done"),
+        (RunConfig(target_success_rate=0.9), 0, 0.0, [0.5, 0.89], None),
+        (RunConfig(target_success_rate=0.9), 0, 0.0, [0.92, 0.5], "success 0.920 reached"),
+        (RunConfig(), 10**9, 1e9, [1.0], None),
+    ],
+)
+def test_other_rules(
+    run: RunConfig, steps: int, minutes: float, rates: list[float], expected: str | None
+) -> None:
+    rule = StoppingRule(run)
+    for rate in rates:
+        rule.observe_evaluation(evaluation(rate))
+    reason = rule.reason(steps, minutes)
+    assert (reason is None) == (expected is None)
+    assert expected is None or expected in str(reason)

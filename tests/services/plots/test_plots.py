@@ -1,0 +1,140 @@
+"""Figures and films from synthetic runs: they are written, readable, and of the right size."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from mrcdrl.common.config import ArenaConfig, load_config
+from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, UInt8Array
+from mrcdrl.services.monitor.recorder import Recorder
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
+from mrcdrl.services.plots.film import compose_frame, write_film
+
+CONFIG = load_config("quick", environ={})
+
+
+def record(run_dir: Path, num_episodes: int, num_evaluations: int) -> None:
+    state = RunState(CONFIG)
+    with Recorder(run_dir, CONFIG) as recorder:
+        for number in range(num_episodes):
+            outcome = Outcome.SUCCESS if number % 7 < number / 60 else Outcome.COLLISION
+            episode = EpisodeSummary("a", 0, number, outcome, 99, 1.0 * number, 1, 0.1, 5, 2.0)
+            state.observe_episode(episode)
+            recorder.record_episode(episode, state, 0.5 * number)
+        for k in range(num_evaluations):
+            rate = k / num_evaluations
+            judged = Evaluation("0", 1, k, 500 * k, 2, 100, rate, 1 - rate, 0.0,
+                                (0.9 * rate, 1.0), 9.0, 9.0, 4.0, 9.0, 9.0, 1, 20.0)  # fmt: skip
+            recorder.record_evaluation(state.observe_evaluation(judged, 30.0 * k))
+
+
+@pytest.mark.parametrize(
+    ("num_episodes", "num_evaluations"), [(0, 0), (1, 1), (30, 2), (450, 12), (4_100, 3)]
+)
+def test_training_curve_of_any_length(
+    tmp_path: Path, num_episodes: int, num_evaluations: int
+) -> None:
+    record(tmp_path, num_episodes, num_evaluations)
+    training_curve(tmp_path, tmp_path / "curve.png")
+    with Image.open(tmp_path / "curve.png") as image:
+        assert min(image.size) > 1_000
+        assert len(np.unique(np.asarray(image.convert("L")))) > 50
+
+
+def test_training_curve_of_a_directory_without_records(tmp_path: Path) -> None:
+    training_curve(tmp_path, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("num_episodes", [0, 1, 6])
+def test_trajectories_show_starts_and_targets(tmp_path: Path, num_episodes: int) -> None:
+    robots = np.stack([np.linspace((100, 200, 0), (400, 200 + 50 * k, 1), 40) for k in range(3)], 1)
+    targets = np.array([[400.0, 200.0], [400.0, 250.0], [100.0, 500.0]])
+    episodes = [
+        Path2D(robots, targets, np.array([[300.0, 200, 30]]), Outcome.SUCCESS)
+    ] * num_episodes
+    trajectories(episodes, ArenaConfig(num_robots=3), tmp_path / "paths.png")
+    with Image.open(tmp_path / "paths.png") as image:
+        colours = {tuple(pixel) for pixel in np.asarray(image.convert("RGB")).reshape(-1, 3)}
+    assert ((255, 0, 0) in colours) == (num_episodes > 0)
+    assert ((32, 80, 208) in colours) == (num_episodes > 0)
+
+
+def test_an_episode_of_one_frame_can_be_drawn(tmp_path: Path) -> None:
+    robots, targets = np.full((1, 2, 3), 100.0), np.full((2, 2), 300.0)
+    still = Path2D(robots, targets, np.empty((0, 3)), Outcome.COLLISION)
+    trajectories([still], ArenaConfig(), tmp_path / "paths.png")
+    assert (tmp_path / "paths.png").exists()
+
+
+@pytest.mark.parametrize("num_robots", [1, 2, 3, 4, 10])
+def test_composed_frames_hold_arena_views_and_caption(num_robots: int) -> None:
+    arena = np.full((600, 600, 3), (10, 120, 200), np.uint8)
+    views = np.full((num_robots, 60, 60), 199, np.uint8)
+    frame = compose_frame(arena, views, "episode 1 · ε 0.01")
+    assert frame.dtype == np.uint8
+    assert [side % 2 for side in frame.shape[:2]] == [0, 0]
+    assert (frame[:600, :600] == arena).all()
+    enlarged = (frame[:600, 600:] == 199).all(axis=2).sum()
+    assert enlarged >= num_robots * 60 * 60 * (16 if num_robots <= 4 else 4) * 0.99
+    assert (frame[600:] > 200).any()
+
+
+def counting_frames(num: int, height: int, width: int) -> Iterator[UInt8Array]:
+    for k in range(num):
+        yield np.full((height, width, 3), 10 * k, np.uint8)
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 96), (65, 97)])
+def test_a_film_reads_back(tmp_path: Path, height: int, width: int) -> None:
+    path = tmp_path / "film.mp4"
+    assert write_film(path, counting_frames(20, height, width), 30) == 20
+    with av.open(str(path)) as film:
+        stream = film.streams.video[0]
+        assert (stream.codec_context.name, stream.average_rate) == ("h264", 30)
+        assert (stream.width, stream.height) == (96, 64)
+        intensities = [frame.to_ndarray(format="gray").mean() for frame in film.decode(video=0)]
+    assert len(intensities) == 20
+    assert intensities == sorted(intensities)
+
+
+def test_a_gif_is_half_as_large_and_shows_every_third_frame(tmp_path: Path) -> None:
+    path = tmp_path / "film.gif"
+    assert write_film(path, counting_frames(20, 65, 97), 30) == 7
+    intensities = []
+    with Image.open(path) as film:
+        assert (film.size, film.n_frames) == ((48, 32), 7)
+        for number in range(film.n_frames):
+            film.seek(number)
+            assert film.info["duration"] == 100
+            intensities.append(np.asarray(film.convert("L")).mean())
+    np.testing.assert_allclose(intensities, [30 * number for number in range(7)], atol=4)
+
+
+def test_a_gif_keeps_the_arenas_colours(tmp_path: Path) -> None:
+    """BGR in, RGB out: red walls, blue targets, white robots, grey views."""
+    colours = [(0, 0, 255), (255, 0, 0), (255, 255, 255), (76, 76, 76), (0, 0, 0)]
+    frame = np.repeat(np.array(colours, np.uint8)[None], 8, axis=0).repeat(8, axis=1)
+    write_film(tmp_path / "film.gif", [frame], 30)
+    with Image.open(tmp_path / "film.gif") as film:
+        shown = np.asarray(film.convert("RGB"))[2, 2::4]
+    np.testing.assert_allclose(shown, np.array(colours)[:, ::-1], atol=4)
+
+
+def test_films_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MrcdrlError, match=r"film.avi: the name ends in none of .mp4, .gif"):
+        write_film(tmp_path / "film.avi", counting_frames(2, 64, 64), 30)
+    with pytest.raises(MrcdrlError, match="no frame"):
+        write_film(tmp_path / "empty.mp4", [], 30)
+    assert not (tmp_path / "empty.mp4").exists()
+    with pytest.raises(MrcdrlError, match="cannot be written"):
+        write_film(tmp_path / "missing" / "film.mp4", counting_frames(2, 64, 64), 30)
+    sizes = [np.zeros((64, 64, 3), np.uint8), np.zeros((32, 64, 3), np.uint8)]
+    with pytest.raises(MrcdrlError, match="the first"):
+        write_film(tmp_path / "sizes.mp4", sizes, 30)

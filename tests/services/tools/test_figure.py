@@ -1,0 +1,171 @@
+"""`mrcdrl figure`: each image is drawn, shows what it says, and bad requests are refused."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mrcdrl.common.config import load_config, to_toml
+from mrcdrl.common.errors import CheckpointError, ConfigError, MrcdrlError, RunDirectoryError
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_files import write_weights
+from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.services.monitor.recorder import Recorder
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.tools.figure import main
+
+VIEW_PX = 32
+SHORT = {"arena.view_px": str(VIEW_PX), "arena.max_frames": "40"}
+FLAGS = [f"--{name}={value}" for name, value in SHORT.items()]
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with weights, configuration and records."""
+    folder = tmp_path_factory.mktemp("runs") / "three"
+    config = load_config("quick", {**SHORT, "arena.num_robots": "3"}, {})
+    folder.mkdir()
+    payload = weights_to_bytes(QNetwork("duel", view_px=VIEW_PX))
+    write_weights(folder / "checkpoints" / "best.safetensors", payload, {})
+    (folder / "config.toml").write_text(to_toml(config))
+    state = RunState(config)
+    with Recorder(folder, config) as recorder:
+        for number in range(200):
+            episode = EpisodeSummary("a", 0, number, Outcome.SUCCESS, 99, 1.0, 1, 0.1, 5, 2.0)
+            recorder.record_episode(episode, state, 0.5 * number)
+        for k in range(3):
+            judged = Evaluation("0", 1, k, 500 * k, 3, 100, 0.9, 0.1, 0.0,
+                                (0.8, 1.0), 9.0, 9.0, 4.0, 9.0, 9.0, 1, 20.0)  # fmt: skip
+            recorder.record_evaluation(state.observe_evaluation(judged, 30.0 * k))
+    return folder
+
+
+def drawn(out: Path, *argv: object) -> np.ndarray:
+    """RGB of the figure."""
+    assert main([*map(str, argv), "--out", str(out)]) == 0
+    with Image.open(out) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def share(image: np.ndarray, colour: tuple[int, int, int]) -> float:
+    return float((image == colour).all(axis=2).mean())
+
+
+def test_an_arena_has_as_many_targets_as_robots(tmp_path: Path) -> None:
+    one, four = (drawn(tmp_path / "arena.png", "arena", "--robots", num) for num in (1, 4))
+    blue = (0, 0, 255)
+    assert share(four, blue) / share(one, blue) == pytest.approx(4, rel=0.2)
+
+
+def test_arenas_of_runs_and_controllers_stand_side_by_side(tmp_path: Path, run_dir: Path) -> None:
+    one = drawn(tmp_path / "one.png", "arena", run_dir)
+    two = drawn(tmp_path / "two.png", "arena", run_dir, "--controller", "greedy")
+    assert two.shape[0] == pytest.approx(one.shape[0], abs=2)
+    assert two.shape[1] == pytest.approx(2 * one.shape[1], rel=0.1)
+
+
+@pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
+def test_views_are_grey_with_one_rectangle(tmp_path: Path, orientation: str) -> None:
+    image = drawn(
+        tmp_path / "views.png", "views", "--controller", "random", *FLAGS,
+        f"--arena.orientation={orientation}", "--frame", 2,
+    )  # fmt: skip
+    assert share(image, (0, 0, 0)) > 0.3
+    assert 0 < share(image, (255, 144, 32)) < 0.02
+
+
+def test_views_of_a_run_at_a_frame_after_its_end(tmp_path: Path, run_dir: Path) -> None:
+    drawn(tmp_path / "views.png", "views", run_dir, "--frame", 10_000)
+
+
+def test_a_comparison_has_a_row_a_policy_and_a_column_a_start(
+    tmp_path: Path, run_dir: Path
+) -> None:
+    out = tmp_path / "comparison.svg"
+    argv = ["comparison", run_dir, "--controller", "random", "--controller", "safe_circle"]
+    assert main([*map(str, argv), "--episodes", "2", "--out", str(out)]) == 0
+    text = out.read_text("utf-8")
+    assert ElementTree.fromstring(text).tag.endswith("svg")
+    for name in ("three: 0 of 2", "random: 0 of 2", "safe_circle: "):
+        assert f"<!-- {name}" in text
+    assert text.count(" frames -->") == 6
+
+
+def test_trajectories_of_a_run(tmp_path: Path, run_dir: Path) -> None:
+    image = drawn(tmp_path / "paths.png", "trajectories", run_dir, "--episodes", 2)
+    assert share(image, (255, 0, 0)) > 0
+    assert share(image, (32, 80, 208)) > 0
+
+
+def test_curves_name_their_runs(tmp_path: Path, run_dir: Path) -> None:
+    other = tmp_path / "empty"
+    other.mkdir()
+    out = tmp_path / "curves.svg"
+    assert main(["curves", str(run_dir), str(other), "--out", str(out)]) == 0
+    text = out.read_text("utf-8")
+    assert "<!-- three -->" in text
+    assert "<!-- empty -->" in text
+    assert main(["curves", str(other), "--out", str(out)]) == 0
+    assert "<!-- no records -->" in out.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("argv", "error", "message"),
+    [
+        (["arena", "--out", "a.pdf"], MrcdrlError, "none of .png, .svg"),
+        (["arena", "--out", "missing/a.png"], MrcdrlError, "No such file"),
+        (
+            ["trajectories", "--controller", "greedy", "--episodes", "1", "--out", "missing/a.png"],
+            MrcdrlError,
+            "cannot be written: No such file",
+        ),
+        (["views"], ConfigError, "views takes one: either weights or --controller"),
+        (["trajectories", "a", "b"], ConfigError, "trajectories takes one"),
+        (["trajectories", "--controller", "greed"], ConfigError, "did you mean greedy"),
+        (["trajectories", "none.safetensors"], CheckpointError, "No such file"),
+        (["comparison", "--controller", "greedy"], ConfigError, "at least two"),
+        (["curves"], ConfigError, "give their folders"),
+        (["curves", "a", "--controller", "greedy"], ConfigError, "give their folders"),
+        (["curves", "missing"], RunDirectoryError, "missing is no run's folder"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    argv: list[str],
+    error: type[Exception],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=message):
+        main(["--out", "a.png", *argv] if "--out" not in argv else argv)
+
+
+def test_policies_of_different_arenas_are_not_compared(tmp_path: Path, run_dir: Path) -> None:
+    other = tmp_path / "two"
+    payload = weights_to_bytes(QNetwork("duel", view_px=VIEW_PX))
+    write_weights(other / "checkpoints" / "best.safetensors", payload, {})
+    (other / "config.toml").write_text(to_toml(load_config("quick", SHORT, {})))
+    with pytest.raises(ConfigError, match=r"arena\.num_robots differs"):
+        main(["comparison", str(run_dir), str(other), "--out", str(tmp_path / "a.png")])
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["arena"], "--out"),
+        (["map", "--out", "a.png"], "invalid choice: 'map'"),
+        (["arena", "--out", "a.png", "--episodes", "0"], "--episodes 0: at least 1"),
+        (["arena", "--out", "a.png", "--frame", "-1"], "--frame -1: at least 0"),
+    ],
+)
+def test_wrong_flags_are_refused(
+    argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(argv)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,110 @@
+"""What is judged, from flags; and what is wrong with them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mrcdrl.common.config import load_config, to_toml
+from mrcdrl.common.errors import CheckpointError, ConfigError
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_files import write_weights
+from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.services.evaluator.trial import ControllerPlayer, PolicyPlayer
+from mrcdrl.services.tools.subject import Subject, subject, subject_parser, weights_path
+
+VIEW_PX = 32
+VIEW = f"--arena.view_px={VIEW_PX}"
+
+
+@pytest.fixture(scope="module")
+def payload() -> bytes:
+    return weights_to_bytes(QNetwork("duel", view_px=VIEW_PX))
+
+
+def named(*argv: object) -> Subject:
+    return subject(subject_parser("evaluate", "").parse_args([str(arg) for arg in argv]))
+
+
+def test_a_controller_plays_in_the_preset_quick() -> None:
+    found = named("--controller", "greedy", "--robots", "3")
+    assert (found.controller, found.policy, found.weights.version) == ("greedy", None, 0)
+    assert found.config.arena.num_robots == 3
+    assert isinstance(found.player(0), ControllerPlayer)
+
+
+def test_an_unknown_controller_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'greed'; did you mean greedy"):
+        named("--controller", "greed")
+
+
+@pytest.mark.parametrize("argv", [(), ("weights.safetensors", "--controller", "greedy")])
+def test_either_weights_or_a_controller(argv: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match="either weights or --controller"):
+        named(*argv)
+
+
+def test_weights_are_loaded_with_what_is_known_of_them(tmp_path: Path, payload: bytes) -> None:
+    known = {"weights_epoch": 1, "weights_version": 7, "learner_step": 700}
+    write_weights(tmp_path / "best.safetensors", payload, known)
+    found = named(tmp_path / "best.safetensors", VIEW)
+    assert (found.weights.order, found.weights.learner_step) == ((1, 7), 700)
+    assert found.weights.payload == payload
+    assert found.policy is not None
+    assert isinstance(found.player(0), PolicyPlayer)
+
+
+def test_weights_with_nothing_beside_them_are_version_0(tmp_path: Path, payload: bytes) -> None:
+    (tmp_path / "some.safetensors").write_bytes(payload)
+    assert named(tmp_path / "some.safetensors", VIEW).weights.order == (0, 0)
+
+
+def test_what_is_known_of_other_weights_is_not_told_of_these(
+    tmp_path: Path, payload: bytes
+) -> None:
+    write_weights(tmp_path / "best.safetensors", payload, {"weights_version": 7})
+    manifest = json.loads((tmp_path / "best.json").read_text())
+    (tmp_path / "best.json").write_text(json.dumps({**manifest, "sha256": "0" * 64}))
+    assert named(tmp_path / "best.safetensors", VIEW).weights.version == 0
+
+
+def test_missing_weights_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="No such file"):
+        named(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("content", [b"", b"no safetensors", b"\x08" + b"\x00" * 7 + b"{}      "])
+def test_foreign_bytes_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "foreign.safetensors").write_bytes(content)
+    with pytest.raises(CheckpointError):
+        named(tmp_path / "foreign.safetensors")
+
+
+def test_weights_of_another_view_are_refused(tmp_path: Path, payload: bytes) -> None:
+    (tmp_path / "some.safetensors").write_bytes(payload)
+    with pytest.raises(CheckpointError, match="sees 4 images of 32 px, the arena gives 4 of 60"):
+        named(tmp_path / "some.safetensors")
+
+
+def test_a_folder_stands_for_its_best_weights_or_the_newest(tmp_path: Path, payload: bytes) -> None:
+    checkpoints = tmp_path / "checkpoints"
+    with pytest.raises(CheckpointError, match="holds no weights"):
+        weights_path(tmp_path)
+    for step in (5, 40, 300):
+        folder = checkpoints / f"step_{step:09d}"
+        folder.mkdir(parents=True)
+        (folder / "model.safetensors").write_bytes(payload)
+    assert weights_path(tmp_path) == checkpoints / "step_000000300" / "model.safetensors"
+    folder = checkpoints / "step_000000040"
+    assert weights_path(folder) == folder / "model.safetensors"
+    (checkpoints / "best.safetensors").write_bytes(payload)
+    assert weights_path(tmp_path) == checkpoints / "best.safetensors"
+
+
+def test_a_runs_weights_are_judged_in_its_own_arena(tmp_path: Path, payload: bytes) -> None:
+    own = load_config("smoke", {"arena.num_robots": "4", "arena.view_px": str(VIEW_PX)}, {})
+    (tmp_path / "config.toml").write_text(to_toml(own))
+    write_weights(tmp_path / "checkpoints" / "best.safetensors", payload, {})
+    assert named(tmp_path).config.arena == own.arena
+    assert named(tmp_path, "--robots", "2").config.arena.num_robots == 2
+    assert named(tmp_path, "--config", "smoke", VIEW).config.arena.num_robots == 2
