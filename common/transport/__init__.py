@@ -1,6 +1,6 @@
-"""Zenoh, and nothing else in the project imports it: sessions, publications, queries, presence."""
+"""The transport over Zenoh, which nothing else imports: sessions, publications, queries."""
 
-from mrcdrl.common.transport.access_log import Refusals
+from mrcdrl.common.transport.access_log import AccessLog
 from mrcdrl.common.transport.publications import (
     LatestSubscriber,
     Presence,
@@ -12,13 +12,13 @@ from mrcdrl.common.transport.session import ROUTER_FILE, Session, free_endpoint
 
 __all__ = [
     "ROUTER_FILE",
+    "AccessLog",
     "Client",
     "LatestSubscriber",
     "PendingReply",
     "Presence",
     "Publisher",
     "QueueSubscriber",
-    "Refusals",
     "Request",
     "Server",
     "Session",

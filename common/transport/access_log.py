@@ -1,8 +1,10 @@
-"""What a router refuses, in its own log: Zenoh says so only among everything that passes.
+"""The router's access log: what it refuses, and to whom.
 
-Invariants: the first refusal of a kind is logged at once, more of it once in a while and counted;
-however much is refused, the log grows slowly and nothing here grows without bound. Everything
-else that Zenoh warns of is handed on.
+Zenoh reports refusals only in a trace of every message that passes; this module reads that trace.
+
+Invariants: the first refusal of a kind is logged at once, repetitions are counted and logged every
+few seconds; however much is refused, the log grows slowly and memory is bounded. Zenoh's other
+warnings are passed on.
 """
 
 import logging
@@ -20,16 +22,16 @@ import zenoh
 _LOG = logging.getLogger("router")
 _ACCESS = "zenoh::net::routing::interceptor::access_control"
 _FILTER = f"warn,{_ACCESS}=trace"
-_AGAIN_S = 10.0  # between lines that count repetitions
-_KINDS = 100  # of refusals told apart in that time
-_NAMES = 10_000  # of clients remembered
+_REPEAT_S = 10.0  # between lines that count repetitions
+_KINDS = 100  # kinds of refusal counted separately in that time
+_NAMES = 10_000  # clients remembered
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _LINE = re.compile(
     r"\S+ +(?P<level>[A-Z]+) (?P<thread>.*?ThreadId\(\d+\)) (?P<module>\S+): (?P<text>.*)"
 )
-_JUDGEMENTS = 9  # made ahead for a key: one for each kind of message
+_DECISIONS = 9  # that Zenoh caches for a new key: one for each kind of message
 _CACHING = re.compile(r"ACL \((?P<flow>\w+)\): caching permissions for `(?P<key>.*)`")
-_JUDGED = re.compile(
+_DECISION = re.compile(
     r"(?P<cached>Using cached result: )?(?P<client>[0-9a-f]+) (?:on (?P<subject>\S+) )?is "
     r"(?P<un>un)?authorized to (?P<action>.*) \((?P<flow>\w+)\) on (?P<key>.*)"
 )
@@ -37,59 +39,62 @@ _PASSED, _ALLOWED = "Using cached result: ", " is authorized to "
 _UNKNOWN = re.compile(r"(?P<client>[0-9a-f]+) did not match any configured ACL subject")
 _COMMON_NAME = re.compile(r"CertCommonName\((.*?)\)")
 _HANDSHAKE = "zenoh_link_tls::"
-_HINT = re.compile(r" Hint: increase the system open file limit\.$")  # wrong, where TLS refuses
+_HINT = re.compile(r" Hint: increase the system open file limit\.$")  # wrong when TLS refuses
 
 
-class Judge:
-    """Tells, line by line of Zenoh's log, what was refused."""
+class AccessLogParser:
+    """Finds the refusals in Zenoh's log, line by line."""
 
     def __init__(self) -> None:
         self._names: dict[str, str] = {}  # client's id to its certificate's common name
-        self._ahead: dict[str, tuple[str, str, int]] = {}  # thread to flow, key, judgements to come
+        self._caching: dict[
+            str, tuple[str, str, int]
+        ] = {}  # thread to flow, key, decisions to come
 
-    def read(self, line: str) -> str | None:
-        """What a line says, if somebody has to know it."""
+    def parse(self, line: str) -> str | None:
+        """The message to log for a line of Zenoh's; None if there is none."""
         if _PASSED in line and _ALLOWED in line:
-            return None  # nearly all lines: a message that passes is two
+            return None  # nearly all lines: each message that passes writes two
         parts = _LINE.match(_COLOUR.sub("", line))
         if parts is None:
             return line.strip() or None
         text = parts["text"]
         if parts["module"] == _ACCESS:
-            return self._judged(parts["thread"], text)
+            return self._refusal(parts["thread"], text)
         if parts["module"].startswith(_HANDSHAKE):
             return f"refused a connection: {_HINT.sub('', text)}"
         return f"{parts['module']}: {text}"
 
-    def _judged(self, thread: str, text: str) -> str | None:
+    def _refusal(self, thread: str, text: str) -> str | None:
+        """The refusal that a line of the access control reports, if it reports one."""
         if caching := _CACHING.match(text):
-            self._ahead[thread] = caching["flow"], caching["key"], _JUDGEMENTS
+            self._caching[thread] = caching["flow"], caching["key"], _DECISIONS
             return None
         if unknown := _UNKNOWN.match(text):
             return f"refused everything from {unknown['client']}: its certificate has no role here"
-        judged = _JUDGED.match(text)
-        if judged is None:
+        decision = _DECISION.match(text)
+        if decision is None:
             return None
-        name = _COMMON_NAME.search(judged["subject"] or "")
+        name = _COMMON_NAME.search(decision["subject"] or "")
         if name:
             if len(self._names) >= _NAMES:
                 self._names.clear()
-            self._names[judged["client"]] = name[1]
-        flow, key, left = self._ahead.pop(thread, ("", "", 0))
-        if left and not judged["cached"] and (flow, key) == (judged["flow"], judged["key"]):
-            self._ahead[thread] = flow, key, left - 1
-            return None  # what would be, if it were asked for
-        if not judged["un"] or judged["flow"] != "ingress":
+            self._names[decision["client"]] = name[1]
+        flow, key, left = self._caching.pop(thread, ("", "", 0))
+        if left and not decision["cached"] and (flow, key) == (decision["flow"], decision["key"]):
+            self._caching[thread] = flow, key, left - 1
+            return None  # cached for a message yet to come; none was refused
+        if not decision["un"] or decision["flow"] != "ingress":
             return None
-        who = self._names.get(judged["client"], judged["client"])
-        return f"refused {who}: {judged['action']} on {judged['key']}"
+        who = self._names.get(decision["client"], decision["client"])
+        return f"refused {who}: {decision['action']} on {decision['key']}"
 
 
-class Refusals:
-    """Reads Zenoh's log of this process as long as the `with` block lasts.
+class AccessLog:
+    """Logs what this process's Zenoh refuses, for as long as the `with` block lasts.
 
-    Takes the process's standard output, to which Zenoh writes, for itself; once a process, before
-    its first session.
+    Captures the process's standard output, to which Zenoh writes. Use it once in a process, before
+    the first session.
     """
 
     def __enter__(self) -> Self:
@@ -100,7 +105,7 @@ class Refusals:
         os.close(writing)
         zenoh.init_log_from_env_or(_FILTER)
         self._reader = threading.Thread(
-            target=self._follow, args=(os.fdopen(reading, errors="replace"),), name="refusals"
+            target=self._follow, args=(os.fdopen(reading, errors="replace"),), name="access-log"
         )
         self._reader.start()
         return self
@@ -111,39 +116,39 @@ class Refusals:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        os.dup2(self._stdout, 1)  # which ends the pipe, and with it the thread
+        os.dup2(self._stdout, 1)  # ends the pipe, and with it the thread
         os.close(self._stdout)
         self._reader.join()
 
     def _follow(self, lines: TextIO) -> None:
-        judge, counted = Judge(), _Counted()
+        parser, repeats = AccessLogParser(), _Repeats()
         with lines:
             for line in lines:
-                said = judge.read(line)
-                if said is not None:
-                    counted.add(said)
-        counted.tell()
+                message = parser.parse(line)
+                if message is not None:
+                    repeats.add(message)
+        repeats.flush()
 
 
-class _Counted:
-    """Logs what is new, and counts the rest."""
+class _Repeats:
+    """Logs a new message at once, and counts its repetitions."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
-        self._told_s = time.monotonic()
+        self._flushed_s = time.monotonic()
 
-    def add(self, said: str) -> None:
-        if time.monotonic() - self._told_s > _AGAIN_S:
-            self.tell()
-        if said not in self._counts and len(self._counts) >= _KINDS:
-            said = "refused more, of other kinds"
-        self._counts[said] += 1
-        if self._counts[said] == 1:
-            _LOG.warning("%s", said)
+    def add(self, message: str) -> None:
+        if time.monotonic() - self._flushed_s > _REPEAT_S:
+            self.flush()
+        if message not in self._counts and len(self._counts) >= _KINDS:
+            message = "refused more requests, of other kinds"
+        self._counts[message] += 1
+        if self._counts[message] == 1:
+            _LOG.warning("%s", message)
 
-    def tell(self) -> None:
-        for said, times in self._counts.items():
+    def flush(self) -> None:
+        for message, times in self._counts.items():
             if times > 1:
-                _LOG.warning("%s (%d times more)", said, times - 1)
+                _LOG.warning("%s (%d more times)", message, times - 1)
         self._counts.clear()
-        self._told_s = time.monotonic()
+        self._flushed_s = time.monotonic()

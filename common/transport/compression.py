@@ -1,9 +1,9 @@
-"""Large messages between hosts, compressed as a whole.
+"""Compression of large messages between hosts, each as a whole.
 
     0xC1 "lz4", length uint32, one LZ4 block
 
-Invariants: a message that is not so marked is itself, and no message of ours begins with the mark;
-nothing is expanded beyond the largest message that is allowed.
+Invariants: a message without this mark is sent as it is, and no message of ours begins with the
+mark; nothing expands beyond the largest message allowed.
 """
 
 import struct
@@ -19,14 +19,14 @@ _MARK = b"\xc1lz4"
 
 
 def compressed(parts: Sequence[Part]) -> bytes:
-    """A message given in parts, as one block."""
+    """Compress a message, given in parts, as one block."""
     message = b"".join(parts)
     block: bytes = lz4.block.compress(message, store_size=False)
     return _HEAD.pack(_MARK, len(message)) + block
 
 
 def expanded(payload: bytes, max_message_bytes: int) -> bytes:
-    """The message of a payload; raises WireError where it is damaged or too large."""
+    """Expand a payload if it is compressed; raises WireError if it is damaged or too large."""
     if payload[: len(_MARK)] != _MARK:
         return payload
     if len(payload) < _HEAD.size:

@@ -1,4 +1,4 @@
-"""Every Zenoh key expression of a run; literals stand here only.
+"""Every Zenoh key expression of a run; no other module spells one out.
 
 mrcdrl/<run>/replay/<shard>/insert     query: Chunk -> InsertReply
 mrcdrl/<run>/replay/<shard>/sample     query: SampleRequest -> Samples
@@ -8,8 +8,8 @@ mrcdrl/<run>/leases                    query: LeaseRequest -> LeaseReply
 mrcdrl/<run>/weights                   publication and query: Weights
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
-mrcdrl/<run>/stats/<role>/<worker>       publication: Stats
-mrcdrl/<run>/live/<role>/<worker>        liveliness token
+mrcdrl/<run>/stats/<role>/<worker>     publication: Stats
+mrcdrl/<run>/live/<role>/<worker>      liveliness token
 """
 
 from dataclasses import dataclass

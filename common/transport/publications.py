@@ -1,4 +1,4 @@
-"""What is published and followed without an answer: messages, the newest message, who is there.
+"""Publications, which nobody answers: messages in order, the newest only, and presence.
 
 Invariants: Zenoh's callbacks only enqueue; each object is read by one thread; every queue says
 what happens when it is full.
@@ -15,22 +15,22 @@ from mrcdrl.common.errors import TransportError
 
 
 class Publisher:
-    """Puts bytes on one key."""
+    """Publishes bytes on one key."""
 
     def __init__(self) -> None:
         self._publisher: Any = None
 
     def attach(self, publisher: Any) -> None:
-        """Go on with this one of Zenoh's."""
+        """Use this publisher of Zenoh's from now on."""
         self._publisher = publisher
 
     def put(self, payload: bytes) -> None:
-        """Publish; what nobody subscribes to is lost without an error."""
+        """Publish; without a subscriber the message is lost, and no error raised."""
         publisher = self._publisher
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            if publisher is not self._publisher:  # the session was renewed meanwhile
+            if publisher is not self._publisher:  # the session was replaced meanwhile
                 return self.put(payload)
             raise TransportError(f"cannot publish: {error}") from error
 
@@ -45,7 +45,7 @@ class LatestSubscriber:
         self.oversized = 0
 
     def offer(self, sample: Any) -> None:
-        """For Zenoh's callback."""
+        """Zenoh's callback."""
         if len(sample.payload) > self._max_bytes:
             self.oversized += 1
             return
@@ -55,7 +55,7 @@ class LatestSubscriber:
             self._changed.notify_all()
 
     def take(self, timeout_s: float = 0.0) -> bytes | None:
-        """The newest not taken yet; None where none came within `timeout_s`."""
+        """The newest, if not taken yet; None if none came within `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not None, timeout_s)
             newest, self._newest = self._newest, None
@@ -71,7 +71,7 @@ class QueueSubscriber:
         self.dropped = 0
 
     def offer(self, sample: Any) -> None:
-        """For Zenoh's callback."""
+        """Zenoh's callback."""
         try:
             if len(sample.payload) > self._max_bytes:
                 raise queue.Full
@@ -80,7 +80,7 @@ class QueueSubscriber:
             self.dropped += 1
 
     def take(self, timeout_s: float) -> tuple[str, bytes] | None:
-        """The next (key, payload); None where none came within `timeout_s`."""
+        """The next (key, payload); None if none came within `timeout_s`."""
         try:
             if timeout_s <= 0:
                 return self._waiting.get_nowait()
@@ -89,24 +89,24 @@ class QueueSubscriber:
             return None
 
     def drain(self) -> Iterator[tuple[str, bytes]]:
-        """Everything that waits now."""
+        """Yield everything now in the queue."""
         while (item := self.take(0.0)) is not None:
             yield item
 
 
 class Presence:
-    """Who holds a liveliness token now."""
+    """The liveliness tokens now held."""
 
     def __init__(self) -> None:
         self._changes: queue.SimpleQueue[tuple[str, bool]] = queue.SimpleQueue()
         self._alive: set[str] = set()
 
     def offer(self, sample: Any) -> None:
-        """For Zenoh's callback."""
+        """Zenoh's callback."""
         self._changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
 
     def changes(self) -> Iterator[tuple[str, bool]]:
-        """(key, alive) of what changed since the last call, in order."""
+        """Yield (key, alive) for each change since the last call, in order."""
         while True:
             try:
                 key, alive = self._changes.get_nowait()

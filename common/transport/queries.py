@@ -1,9 +1,11 @@
-"""Questions and answers: a client asks a server, and every wait has an end.
+"""Requests and replies: a client asks a server, and every wait has a deadline.
 
-Invariants: Zenoh's callbacks only enqueue; a request is answered once, by a reply, a refusal, or
-"held", which asks for the same again; no reply at all becomes a DeadlineError that names the peer.
+Invariants: Zenoh's callbacks only enqueue, or refuse at once; a request is answered once, by a
+reply, a refusal, or "held", which means ask again; no reply becomes a DeadlineError that names the
+peer.
 
-A large message between processes of one host goes through a slot (`slots.py`); the query says so:
+A large message between processes of one host goes through a shared buffer (`shared_memory.py`),
+which the wire calls a slot:
 
     attachment of a request   "slot ADDRESS"               a large answer may be put there
                               "slot ADDRESS START LENGTH"  and the request is there already
@@ -12,7 +14,7 @@ A large message between processes of one host goes through a slot (`slots.py`); 
                               "near START LENGTH"          and the message is there
                               "far: REASON"                it could not be opened
 
-Between peers that are far from each other a large message is compressed (`compression.py`).
+Between peers that are far from each other, large messages are compressed (`compression.py`).
 """
 
 import contextlib
@@ -35,49 +37,56 @@ from mrcdrl.common.errors import (
 )
 from mrcdrl.common.messages.framing import Part
 from mrcdrl.common.transport.compression import compressed, expanded
-from mrcdrl.common.transport.shared_memory import LARGE_BYTES, Lender, Slot, Slots, put, room
+from mrcdrl.common.transport.shared_memory import (
+    LARGE_BYTES,
+    BufferPool,
+    OpenedBuffers,
+    SharedBuffer,
+    put,
+    room,
+)
 
 _HELD = "held: "
 _FAR = "far: "
 _KNOWN_FAR = "far"
 _OFFER = re.compile(r"slot (\S+ \d+ \d+ \S+)(?: (\d{1,12}) (\d{1,12}))?")
 _NEAR = re.compile(r"near(?: (\d{1,12}) (\d{1,12}))?")
-_WAITING = 4  # messages of the largest size that may wait for a server
-_LATE_S = 1.0  # Zenoh ends a query at its own timeout; this more is for a callback that is late
+_WAITING = 4  # largest messages that may wait for a server
+_LATE_S = 1.0  # added to Zenoh's own timeout of a query, for a late callback
 
 
 class Request:
-    """A query to be answered once, by `reply`, `refuse` or `hold`."""
+    """A query, answered once, by `reply`, `refuse`, `throttle` or `cannot_open`."""
 
     __slots__ = ("_far", "_memory", "_near", "_query", "arrived_s", "payload")
 
     def __init__(self, query: Any, payload: Part) -> None:
         self._query = query
-        self._memory: memoryview | None = None  # that the client lends
-        self._near: str | None = None  # what the reply says of it
-        self._far = False  # the client is, and knows compressed messages
+        self._memory: memoryview | None = None  # shared by the client
+        self._near: str | None = None  # the reply's attachment
+        self._far = False  # the client is far, so it reads compressed messages
         self.payload = payload
         self.arrived_s = time.monotonic()
 
-    def open(self, slots: Slots, max_message_bytes: int) -> None:
-        """Reach for the slot that the client lends, if it does.
+    def open(self, buffers: OpenedBuffers, max_message_bytes: int) -> None:
+        """Expand a compressed payload, and open the client's buffer if it offers one.
 
-        Raises SharedMemoryError where the payload is in a slot that is out of reach, WireError
-        where it is compressed and damaged.
+        Raises SharedMemoryError if the payload is in a buffer that is out of reach, WireError
+        if it is compressed and damaged.
         """
         if isinstance(self.payload, bytes):
             self.payload = expanded(self.payload, max_message_bytes)
         if self._query.attachment is None:
             return
-        said = self._query.attachment.to_bytes().decode("ascii", "replace")
-        self._far = said == _KNOWN_FAR
+        attachment = self._query.attachment.to_bytes().decode("ascii", "replace")
+        self._far = attachment == _KNOWN_FAR
         if self._far:
             return
-        offer = _OFFER.fullmatch(said)
+        offer = _OFFER.fullmatch(attachment)
         try:
             if offer is None:
                 raise SharedMemoryError("no offer of a slot")
-            self._memory = slots.open(offer[1])
+            self._memory = buffers.open(offer[1])
         except SharedMemoryError as error:
             if offer is not None and offer[2]:
                 raise
@@ -88,7 +97,7 @@ class Request:
             self.payload = _within(self._memory, int(offer[2]), int(offer[3]), max_message_bytes)
 
     def room(self, size: int) -> memoryview | None:
-        """Memory of the client for the last `size` bytes of a large reply, if it lends any."""
+        """The client's memory for the last `size` bytes of a large reply, if it shares any."""
         if self._memory is None or size < LARGE_BYTES:
             return None
         return room(self._memory, size)
@@ -105,19 +114,19 @@ class Request:
         self._answer(lambda: self._query.reply(self._query.key_expr, message, attachment=near))
 
     def refuse(self, reason: str) -> None:
-        """The peer's request is wrong; asking again would not help."""
+        """Answer that the request is wrong: asking again would not help."""
         self._answer(lambda: self._query.reply_err(reason.encode()))
 
     def throttle(self, reason: str) -> None:
-        """Not now; the peer is to ask again."""
+        """Answer "not now": the peer should ask again."""
         self.refuse(_HELD + reason)
 
     def cannot_open(self, reason: str) -> None:
-        """The peer is to ask again over the network."""
+        """Answer that the peer should ask again over the network."""
         self.refuse(_FAR + reason)
 
     def _answer(self, answer: Callable[[], None]) -> None:
-        # A peer that is gone by now asks again when it is back: nothing to report here.
+        # A peer that has left asks again when it is back: nothing to report here.
         with contextlib.suppress(zenoh.ZError):
             answer()
         self._query.drop()
@@ -126,7 +135,7 @@ class Request:
 class Server:
     """Requests in the order of their arrival, for one serving thread.
 
-    At most `capacity` wait, and no more bytes of them than of four messages of the largest size.
+    At most `capacity` wait, with no more bytes in all than four messages of the largest size.
     """
 
     def __init__(self, max_message_bytes: int, capacity: int) -> None:
@@ -134,12 +143,12 @@ class Server:
         self._waiting: queue.Queue[tuple[Request, int]] = queue.Queue(capacity)
         self._lock = threading.Lock()
         self._bytes = 0
-        self._slots = Slots()
-        self.refused = 0  # because they were too large
-        self.throttled = 0  # because too many waited
+        self._buffers = OpenedBuffers()
+        self.refused = 0  # too large or damaged
+        self.throttled = 0  # too many waited
 
     def offer(self, query: Any) -> None:
-        """For Zenoh's callback."""
+        """Zenoh's callback."""
         size = 0 if query.payload is None else len(query.payload)
         if size > self._max_bytes:
             self.refused += 1
@@ -156,7 +165,7 @@ class Server:
             request.throttle(f"{self._waiting.qsize()} requests are waiting")
 
     def take(self, timeout_s: float) -> Request | None:
-        """The next request; None where none came within `timeout_s`."""
+        """The next request; None if none came within `timeout_s`."""
         try:
             request, size = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
@@ -164,7 +173,7 @@ class Server:
         with self._lock:
             self._bytes -= size
         try:
-            request.open(self._slots, self._max_bytes)
+            request.open(self._buffers, self._max_bytes)
         except SharedMemoryError as error:
             request.cannot_open(str(error))
             return None
@@ -176,44 +185,44 @@ class Server:
 
 
 class PendingReply:
-    """The reply to one query that is under way; for the thread that asked."""
+    """The reply to one query in flight, for the thread that asked."""
 
     def __init__(
         self,
         whom: str,
         timeout_s: float,
         max_message_bytes: int,
-        lender: Lender,
-        slot: Slot | None,
+        pool: BufferPool,
+        buffer: SharedBuffer | None,
     ) -> None:
         self._whom = whom
         self._deadline = time.monotonic() + timeout_s + _LATE_S
         self._max_bytes = max_message_bytes
-        self._lender = lender
-        self._slot = slot
+        self._pool = pool
+        self._buffer = buffer
         self._reply: Any = None
         self._ended = threading.Event()
 
     def offer(self, reply: Any) -> None:
-        """For Zenoh's callback."""
+        """Zenoh's callback."""
         if self._reply is None:
             self._reply = reply
         self._ended.set()
 
     def end(self) -> None:
-        """For Zenoh's callback: no further reply will come."""
+        """Zenoh's callback: no further reply will come."""
         self._ended.set()
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether `result` would not have to wait; waits up to `timeout_s` until it is so."""
+        """Wait up to `timeout_s`; whether `result` would now return at once."""
         left = self._deadline - time.monotonic()
         return self._ended.wait(max(min(timeout_s, left), 0.0)) or left <= timeout_s
 
     def result(self) -> Part:
         """The reply's payload, valid until `release`.
 
-        Raises ThrottledError or RefusedError for a refusal, DeadlineError where no reply came,
-        WireError where it is compressed and damaged.
+        Raises ThrottledError or RefusedError for a refusal, DeadlineError if no reply came,
+        WireError if it is compressed and damaged.
         """
         self._ended.wait(max(self._deadline - time.monotonic(), 0.0))
         reply = self._reply
@@ -226,32 +235,32 @@ class PendingReply:
             raise DeadlineError(f"no answer from {self._whom} in time")
         self.release()
         if text.startswith(_FAR):
-            self._lender.refused(text.removeprefix(_FAR))
+            self._pool.refused(text.removeprefix(_FAR))
             raise ThrottledError(text)
         if text.startswith(_HELD):
             raise ThrottledError(text.removeprefix(_HELD))
         raise RefusedError(f"{self._whom} refused: {text}")
 
     def release(self) -> None:
-        """What `result` returned is no longer read.
+        """Give the buffer back: the result is no longer read.
 
-        Only after an answer: a peer that gave none may yet write to the slot.
+        Not without an answer: a peer that gave none may still write to the buffer.
         """
-        if self._slot is not None:
-            self._lender.give_back(self._slot)
-            self._slot = None
+        if self._buffer is not None:
+            self._pool.give_back(self._buffer)
+            self._buffer = None
 
     def _payload(self, sample: Any) -> Part:
-        said = "" if sample.attachment is None else sample.attachment.to_bytes().decode()
-        near = _NEAR.fullmatch(said)
+        attachment = "" if sample.attachment is None else sample.attachment.to_bytes().decode()
+        near = _NEAR.fullmatch(attachment)
         if near:
-            self._lender.opened()
-        elif said.startswith(_FAR):
-            self._lender.refused(said.removeprefix(_FAR))
+            self._pool.opened()
+        elif attachment.startswith(_FAR):
+            self._pool.refused(attachment.removeprefix(_FAR))
         try:
-            if near and near[1] and self._slot is not None:
+            if near and near[1] and self._buffer is not None:
                 start, length = int(near[1]), int(near[2])
-                return _within(self._slot.memory, start, length, self._max_bytes)
+                return _within(self._buffer.memory, start, length, self._max_bytes)
         except SharedMemoryError as error:
             raise RefusedError(f"the answer of {self._whom}: {error}") from error
         self.release()
@@ -261,37 +270,39 @@ class PendingReply:
 
 
 class Client:
-    """Sends queries to one key; any number may be under way, all of one thread."""
+    """Sends queries to one key; any number may be in flight, all from one thread."""
 
-    def __init__(self, whom: str, timeout_s: float, max_message_bytes: int, lender: Lender) -> None:
+    def __init__(
+        self, whom: str, timeout_s: float, max_message_bytes: int, pool: BufferPool
+    ) -> None:
         self._querier: Any = None
         self._whom = whom
         self._timeout_s = timeout_s
         self._max_bytes = max_message_bytes
-        self._lender = lender
+        self._pool = pool
 
     def attach(self, querier: Any) -> None:
-        """Go on with this one of Zenoh's."""
+        """Use this querier of Zenoh's from now on."""
         self._querier = querier
 
     def ask(self, payload: Part | Sequence[Part], *, reply_bytes: int = 0) -> PendingReply:
-        """Send a query, given whole or in parts; its answer is waited for with `result`.
+        """Send a query, given whole or in parts; `result` then waits for its answer.
 
-        reply_bytes: about how large an answer is due.
+        reply_bytes: the expected size of the answer, roughly.
         """
         parts = [payload] if isinstance(payload, Part) else payload
         length = sum(map(len, parts))
-        slot = self._lend(max(length, reply_bytes))
-        attachment = _KNOWN_FAR if self._lender.near is False else None
-        if slot is not None:
-            attachment = f"slot {slot.address}"
-            if self._lender.near and length >= LARGE_BYTES:
-                place = put(slot.memory, parts)
+        buffer = self._borrow(max(length, reply_bytes))
+        attachment = _KNOWN_FAR if self._pool.near is False else None
+        if buffer is not None:
+            attachment = f"slot {buffer.address}"
+            if self._pool.near and length >= LARGE_BYTES:
+                place = put(buffer.memory, parts)
                 if place is not None:
                     attachment, parts = f"{attachment} {place[0]} {place[1]}", ()
-        pending = PendingReply(self._whom, self._timeout_s, self._max_bytes, self._lender, slot)
+        pending = PendingReply(self._whom, self._timeout_s, self._max_bytes, self._pool, buffer)
         handler = zenoh.handlers.Callback(pending.offer, pending.end, indirect=False)
-        message = _over_network(parts, far=self._lender.near is False)
+        message = _over_network(parts, far=self._pool.near is False)
         self._get(handler, message, attachment)
         return pending
 
@@ -300,19 +311,19 @@ class Client:
         try:
             querier.get(handler, payload=message, attachment=attachment)
         except zenoh.ZError as error:
-            if querier is not self._querier:  # the session was renewed meanwhile
+            if querier is not self._querier:  # the session was replaced meanwhile
                 return self._get(handler, message, attachment)
             raise TransportError(f"cannot ask {self._whom}: {error}") from error
 
-    def _lend(self, size: int) -> Slot | None:
-        """A slot for a large message, or a first one to see whether the peer can open it."""
-        if size < LARGE_BYTES and self._lender.near is not None:
+    def _borrow(self, size: int) -> SharedBuffer | None:
+        """A buffer for a large message, or a first one to see whether the peer can open it."""
+        if size < LARGE_BYTES and self._pool.near is not None:
             return None
-        return self._lender.borrow(size)
+        return self._pool.borrow(size)
 
 
 def _over_network(parts: Sequence[Part], *, far: bool) -> bytes:
-    """What crosses the network; compressed where it is large and goes to another host."""
+    """The bytes for the network, compressed if they are many and the peer is far."""
     if far and sum(map(len, parts)) >= LARGE_BYTES:
         return compressed(parts)
     return b"".join(parts)

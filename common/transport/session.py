@@ -1,13 +1,14 @@
-"""One Zenoh session and what it declares, with every wait bounded and every queue's end stated.
+"""One Zenoh session and what it declares; every wait has a deadline, every queue a limit.
 
-Invariants: Zenoh's callbacks only enqueue; all threads here belong to callers; foreign errors
-become ours at this boundary; leaving the `with` block closes the session and everything it
-declared. What Zenoh loses and when: docs/wire.md.
+Invariants: Zenoh's callbacks only enqueue; the one thread here, `renew`, belongs to the session
+and is joined by `close`; Zenoh's errors become ours at this boundary; leaving the `with` block
+closes the session and everything it declared.
 """
 
 import contextlib
 import json
 import logging
+import queue
 import re
 import socket
 import threading
@@ -30,17 +31,17 @@ from mrcdrl.common.transport.publications import (
     QueueSubscriber,
 )
 from mrcdrl.common.transport.queries import Client, Server
-from mrcdrl.common.transport.shared_memory import Lender
+from mrcdrl.common.transport.shared_memory import BufferPool
 
 ROUTER_FILE = Path(str(resources.files("mrcdrl.configs"))) / "router.json5"
 _LOG = logging.getLogger("transport")
-_TRY_AGAIN_S = 0.2
+_RETRY_S = 0.2
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _ENCRYPTED = "tls/"
 _LOOPBACK = re.compile(r"[a-z]+/(127\.|\[::1\]|localhost:)")
 _CLIENT_SETTINGS: dict[str, Any] = {
     "mode": "client",
-    "connect/timeout_ms": 2_000,  # of one attempt
+    "connect/timeout_ms": 2_000,  # for one attempt
     "connect/exit_on_failure": True,
     "connect/retry": {
         "period_init_ms": 200,
@@ -50,9 +51,9 @@ _CLIENT_SETTINGS: dict[str, Any] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "transport/link/tx/queue/size/data": 16,
-    # A full link holds up its sender for so long, µs, before it is closed.
+    # µs that a full link blocks its sender before it is closed.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
-    "transport/shared_memory/enabled": False,  # our own, in slots.py, has no pool to overflow
+    "transport/shared_memory/enabled": False,  # shared_memory.py has no pool to overflow
     "transport/link/tls/enable_mtls": True,
     "transport/link/tls/close_link_on_expiration": True,
 }
@@ -60,7 +61,7 @@ _CLIENT_SETTINGS: dict[str, Any] = {
 
 @dataclass(slots=True)
 class _Declaration:
-    """What is declared on whichever of Zenoh's sessions is there."""
+    """A declaration, repeated on each Zenoh session that replaces a lost one."""
 
     make: Callable[[zenoh.Session], Any]
     use: Callable[[Any], None]
@@ -74,15 +75,15 @@ class _Declaration:
 class Session(Closing):
     """An open Zenoh session: a router where it listens, a client otherwise.
 
-    A client whose link was lost goes on with a new session of Zenoh's, of another identity, on
-    which all is declared anew: what a router still clears away of the old link, it would take from
-    a new link of the same identity too, which then hears nothing any more (zenoh#1886).
+    A client whose link is lost goes on with a new Zenoh session of another identity, on which
+    everything is declared again. Under the old identity, a router still clearing away the lost
+    link would remove the new declarations too, and the client would hear nothing (zenoh#1886).
 
-    router_file: what to be as a router; by default configs/router.json5. `config` says where to
-    listen and connect, if it says so at all.
+    router_file: the router's configuration; by default configs/router.json5. Endpoints that
+    `config` gives take the place of the file's.
 
-    Raises EndpointError when an endpoint cannot be listened on, nobody answers where it connects
-    within `open_timeout_s`, or certificates are missing; ConfigError for a bad `router_file`.
+    Raises EndpointError if an endpoint cannot be listened on, nobody answers within
+    `open_timeout_s`, or certificates are missing; ConfigError for a bad `router_file`.
     """
 
     def __init__(
@@ -104,20 +105,26 @@ class Session(Closing):
             settings.insert_json5(key, json.dumps(value))
         self._settings = settings
         self._declarations: list[_Declaration] = []
-        self._lock = threading.Lock()  # of what is declared, and where
-        self._renewing = threading.Lock()
+        self._lock = threading.Lock()  # of the declarations and the session they are on
         self._closed = threading.Event()
+        self._lost: queue.SimpleQueue[zenoh.Session | None] = queue.SimpleQueue()  # None: closed
         self._session = self._open(settings, time.monotonic() + open_timeout_s)
         self._listener: Any = None
+        self._renewer: threading.Thread | None = None
         if self._listen:
-            self._say_who_may_join()
+            self._log_who_may_join()
         else:
             self._watch(self._session)
+            self._renewer = threading.Thread(target=self._renew, name="renew")
+            self._renewer.start()
 
     def close(self) -> None:
-        """Undeclare everything and close; again is harmless."""
+        """Undeclare everything and close; harmless if repeated."""
         self._closed.set()
-        with self._renewing, self._lock:
+        self._lost.put(None)
+        if self._renewer is not None:
+            self._renewer.join()
+        with self._lock:
             declarations, self._declarations = self._declarations, []
             for declaration in reversed(declarations):
                 with contextlib.suppress(zenoh.ZError):
@@ -126,33 +133,39 @@ class Session(Closing):
                 self._session.close()  # type: ignore[no-untyped-call]
 
     def _watch(self, session: zenoh.Session) -> None:
-        """Renew it once its link is lost."""
+        """Have `_renew` replace the session once its link is lost."""
 
         def offer(event: Any) -> None:
-            if event.kind == zenoh.SampleKind.DELETE and not self._closed.is_set():
-                threading.Thread(target=self._renew, args=(session,), name="renew").start()
+            if event.kind == zenoh.SampleKind.DELETE:
+                self._lost.put(session)
 
         handler = zenoh.handlers.Callback(offer, indirect=False)
         self._listener = session.info.declare_transport_events_listener(handler)
 
-    def _renew(self, lost: zenoh.Session) -> None:
-        with self._renewing:
-            while not self._closed.is_set() and lost is self._session:
+    def _renew(self) -> None:
+        """Replace each lost session; the thread `renew`, until the session is closed."""
+        while (lost := self._lost.get()) is not None:
+            while lost is self._session and not self._closed.is_set():
                 try:
-                    fresh = zenoh.open(self._settings)
+                    self._move_to(zenoh.open(self._settings))
                 except zenoh.ZError:
-                    self._closed.wait(_TRY_AGAIN_S)
-                    continue
-                self._watch(fresh)
-                with self._lock:
-                    self._session = fresh
-                    for declaration in self._declarations:
-                        declaration.on(fresh)
-                with contextlib.suppress(zenoh.ZError):
-                    lost.close()  # type: ignore[no-untyped-call]
+                    self._closed.wait(_RETRY_S)
+
+    def _move_to(self, fresh: zenoh.Session) -> None:
+        """Declare everything on another session and close the present one; raises ZError."""
+        left, kept = fresh, self._session
+        try:
+            self._watch(fresh)
+            with self._lock:
+                for declaration in self._declarations:
+                    declaration.on(fresh)
+                self._session, left = fresh, kept
+        finally:
+            with contextlib.suppress(zenoh.ZError):
+                left.close()  # type: ignore[no-untyped-call]
 
     def publisher(self, key: str) -> Publisher:
-        """A publisher whose `put` waits rather than drops when the link is full."""
+        """Publisher whose `put` blocks, rather than drops, when the link is full."""
         publisher = Publisher()
         block = zenoh.CongestionControl.BLOCK
         self._declare(
@@ -161,36 +174,36 @@ class Session(Closing):
         return publisher
 
     def latest_subscriber(self, key: str) -> LatestSubscriber:
-        """Keeps the newest publication only: older ones are overwritten."""
+        """Subscriber that keeps the newest publication only: older ones are overwritten."""
         latest = LatestSubscriber(self._config.max_message_bytes)
         handler = zenoh.handlers.Callback(latest.offer, indirect=False)
         self._declare(lambda on: on.declare_subscriber(key, handler))
         return latest
 
     def queue_subscriber(self, key: str, capacity: int = 4096) -> QueueSubscriber:
-        """Keeps publications in order; when full, new ones are dropped and counted."""
+        """Subscriber that keeps publications in order; when full, it drops and counts new ones."""
         waiting = QueueSubscriber(self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(waiting.offer, indirect=False)
         self._declare(lambda on: on.declare_subscriber(key, handler))
         return waiting
 
     def server(self, key: str, capacity: int = 256) -> Server:
-        """Answers queries on `key`; when `capacity` wait already, a new one is refused."""
+        """Server of queries on `key`; while `capacity` wait, it throttles new ones."""
         server = Server(self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(server.offer, indirect=False)
         self._declare(lambda on: on.declare_queryable(key, handler, complete=True))
         return server
 
     def client(
-        self, key: str, whom: str, timeout_s: float | None = None, *, lends: bool = False
+        self, key: str, whom: str, timeout_s: float | None = None, *, shared_memory: bool = False
     ) -> Client:
-        """Asks the queryable on `key`; `whom` names it in errors and in the log.
+        """Client of the queryable on `key`; `whom` names the peer in errors and in the log.
 
-        lends: large messages go through shared memory where the peer can reach it.
+        shared_memory: large messages go through shared memory if the peer can reach it.
         """
         timeout = self._config.timeout_s if timeout_s is None else timeout_s
-        lender = Lender(whom, enabled=lends and self._config.shared_memory)
-        client = Client(whom, timeout, self._config.max_message_bytes, lender)
+        pool = BufferPool(whom, enabled=shared_memory and self._config.shared_memory)
+        client = Client(whom, timeout, self._config.max_message_bytes, pool)
         self._declare(
             lambda on: on.declare_querier(
                 key,
@@ -203,11 +216,11 @@ class Session(Closing):
         return client
 
     def announce(self, key: str) -> None:
-        """Hold a liveliness token on `key` for as long as the session is open."""
+        """Hold a liveliness token on `key` while the session is open."""
         self._declare(lambda on: on.liveliness().declare_token(key))
 
     def presence(self, key: str) -> "Presence":
-        """Follows the liveliness tokens on `key`, those already there included."""
+        """The liveliness tokens on `key`, including those held already."""
         presence = Presence()
         handler = zenoh.handlers.Callback(presence.offer, indirect=False)
         self._declare(lambda on: on.liveliness().declare_subscriber(key, handler, history=True))
@@ -216,7 +229,7 @@ class Session(Closing):
     def _declare(
         self, make: Callable[[zenoh.Session], Any], use: Callable[[Any], None] = lambda _: None
     ) -> None:
-        """make: declares it on a session of Zenoh's. use: takes what that gave, each time."""
+        """make: declares it on a Zenoh session. use: takes the result, each time."""
         declaration = _Declaration(make, use)
         with self._lock:
             declaration.on(self._session)
@@ -239,16 +252,16 @@ class Session(Closing):
                         f"({_first_line(error)})"
                     ) from error
 
-    def _say_who_may_join(self) -> None:
+    def _log_who_may_join(self) -> None:
         where = ", ".join(self._listen)
         if self._config.key:
             _LOG.info("listening on %s, encrypted, for certificates of %s", where, self._config.ca)
         elif all(map(_LOOPBACK.match, self._listen)):
-            _LOG.info("listening on %s, not encrypted: for this machine only", where)
+            _LOG.info("listening on %s, not encrypted: reachable from this machine only", where)
         else:
             _LOG.warning(
-                "listening on %s, not encrypted: whoever reaches it can read and alter every run; "
-                "docs/security.md says how to change that",
+                "listening on %s, not encrypted: anyone who can reach it can read and alter every "
+                "run; docs/security.md says how to change that",
                 where,
             )
 
@@ -259,7 +272,7 @@ class Session(Closing):
 
 
 def free_endpoint() -> str:
-    """A TCP endpoint on loopback whose port nobody listens on now."""
+    """A TCP endpoint on loopback with a port that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -274,12 +287,12 @@ def _endpoints(settings: zenoh.Config, side: str) -> tuple[str, ...]:
 
 
 def _check_endpoints(config: TransportConfig, endpoints: tuple[str, ...]) -> None:
-    """Raises EndpointError where one is missing, wrong, or not as secure as configured."""
+    """Raise EndpointError if one is missing, malformed, or not as secure as configured."""
     if not endpoints:
         raise EndpointError("no endpoint: give --connect or --listen, such as tcp/127.0.0.1:7447")
     for endpoint in endpoints:
         if not _ENDPOINT.fullmatch(endpoint):
-            raise EndpointError(f"{endpoint!r} is no endpoint; write one as tcp/127.0.0.1:7447")
+            raise EndpointError(f"{endpoint!r} is not an endpoint; write one as tcp/127.0.0.1:7447")
         if config.key and not endpoint.startswith(_ENCRYPTED):
             raise EndpointError(
                 f"{endpoint} is not encrypted, but transport.certificate is given; "
@@ -308,7 +321,7 @@ def _read(file: Path) -> zenoh.Config:
 
 
 def _router_settings(config: TransportConfig) -> dict[str, Any]:
-    """What the router's file leaves to this process."""
+    """Settings that the router's file leaves to this process."""
     return {
         "access_control/enabled": bool(config.key),
         "transport/link/rx/max_message_size": 2 * config.max_message_bytes,

@@ -1,12 +1,13 @@
-"""Memory that a client lends to the peer it asks, so that large messages cross no network.
+"""Shared memory for large messages between processes of one host.
 
-A slot is a sealed memfd, named in a request by an address `<boot> <process> <descriptor> <token>`;
-the peer opens it through /proc, writes a large answer into it, or reads a large request from it.
+A client offers its peer a shared buffer, a sealed memfd (a "slot" on the wire). The request names
+it by an address `<boot> <process> <descriptor> <token>`; the peer opens it through /proc, reads a
+large request from it, or writes a large answer into it.
 
-Invariants: a slot has no name in any file system, so nothing is left when either end is killed;
+Invariants: a buffer has no name in any file system, so nothing is left when either end is killed;
 only a sealed memfd of ours that begins with the token is ever mapped, and it cannot shrink under
-its reader; a slot carries one request and its answer at a time, and one whose answer did not come
-is never used again, because the peer may yet write to it. A peer that cannot open the slot
+its reader; a buffer carries one request and its answer at a time, and is never reused if the
+answer did not come, because the peer may still write to it. A peer that cannot open the buffer
 (another host, user or container) is served over the network.
 """
 
@@ -28,18 +29,18 @@ from mrcdrl.common.errors import SharedMemoryError
 from mrcdrl.common.messages.framing import ALIGNMENT, Part
 
 _LOG = logging.getLogger("transport")
-LARGE_BYTES = 32 << 10  # below, the network is as fast
+LARGE_BYTES = 32 << 10  # smaller messages are as fast over the network
 _NAME = "mrcdrl-slot"
 _ADDRESS = re.compile(r"([0-9a-f-]{36}) (\d{1,10}) (\d{1,10}) ([0-9a-f]{32})")
 _TOKEN_BYTES = 16
-_MAX_MAPPED = 1024  # one or two a client; memory of the dead goes when the next is mapped
+_MAX_MAPPED = 1024  # one or two a client; those of dead clients go when the next is mapped
 _SEALS = (
     fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL if sys.platform == "linux" else 0
 )
 
 
-class Slot:
-    """Memory for one request at a time; raises OSError where the system gives none."""
+class SharedBuffer:
+    """Memory for one request at a time; raises OSError if the system has none to give."""
 
     def __init__(self, size: int) -> None:
         """size: bytes of `memory`, rounded up to whole pages."""
@@ -52,49 +53,49 @@ class Slot:
         except OSError:
             os.close(self._descriptor)
             raise
-        weakref.finalize(self, os.close, self._descriptor)  # the map goes with its last view
+        weakref.finalize(self, os.close, self._descriptor)  # the map is freed with its last view
         token = secrets.token_bytes(_TOKEN_BYTES)
         self._map[:_TOKEN_BYTES] = token
         self.address = f"{_boot_id()} {os.getpid()} {self._descriptor} {token.hex()}"
         self.memory = memoryview(self._map)[ALIGNMENT:]
 
 
-class Lender:
-    """The slots that a client lends one peer, as many as it has requests under way."""
+class BufferPool:
+    """The buffers that a client shares with one peer, one for each request in flight."""
 
     def __init__(self, whom: str, *, enabled: bool) -> None:
-        """whom: the peer, in the log."""
+        """whom: the peer's name in the log."""
         self._whom = whom
-        self._free: list[Slot] = []
+        self._free: list[SharedBuffer] = []
         self.enabled = enabled and sys.platform == "linux"
         self.near: bool | None = None
-        """Whether the peer can open them; None before it has answered once."""
+        """Whether the peer can open them; None before its first answer."""
 
-    def borrow(self, size: int) -> Slot | None:
-        """A slot of at least so many bytes; None where the peer is far or memory is short."""
+    def borrow(self, size: int) -> SharedBuffer | None:
+        """A buffer of at least `size` bytes; None if the peer is far or memory is short."""
         if not self.enabled or self.near is False:
             return None
-        for index, slot in enumerate(self._free):
-            if len(slot.memory) >= size:
+        for index, buffer in enumerate(self._free):
+            if len(buffer.memory) >= size:
                 return self._free.pop(index)
-        if self._free:  # too small for what is sent by now
+        if self._free:  # messages have outgrown it
             self._free.pop()
         try:
-            return Slot(size)
+            return SharedBuffer(size)
         except OSError as error:
             self._decide(near=False, why=f"no memory to share: {error.strerror}")
             return None
 
-    def give_back(self, slot: Slot) -> None:
-        """Take a slot again that its peer no longer touches."""
-        self._free.append(slot)
+    def give_back(self, buffer: SharedBuffer) -> None:
+        """Return a buffer that the peer no longer touches."""
+        self._free.append(buffer)
 
     def opened(self) -> None:
-        """The peer could open a slot."""
+        """Note that the peer could open a buffer."""
         self._decide(near=True, why="")
 
     def refused(self, why: str) -> None:
-        """The peer could not open a slot."""
+        """Note that the peer could not open a buffer."""
         self._decide(near=False, why=why)
 
     def _decide(self, *, near: bool, why: str) -> None:
@@ -108,26 +109,26 @@ class Lender:
             _LOG.info("large messages to and from %s go over the network: %s", self._whom, why)
 
 
-class Slots:
-    """Slots of clients, opened by the peer they asked; for one thread."""
+class OpenedBuffers:
+    """Buffers of clients, opened by the peer they asked; for one thread."""
 
     def __init__(self) -> None:
         self._mapped: OrderedDict[str, memoryview] = OrderedDict()
 
     def open(self, address: str) -> memoryview:
-        """The slot's memory; raises SharedMemoryError, saying why, where it is out of reach."""
+        """Memory of a client's buffer; raises SharedMemoryError, saying why it is out of reach."""
         memory = self._mapped.get(address)
         if memory is None:
             memory = _map(address)
-            self._forget_the_dead()
+            self._forget_closed()
             self._mapped[address] = memory
         self._mapped.move_to_end(address)
         while len(self._mapped) > _MAX_MAPPED:
             self._mapped.popitem(last=False)
         return memory
 
-    def _forget_the_dead(self) -> None:
-        for address in [a for a in self._mapped if not _is_slot(_path(a))]:
+    def _forget_closed(self) -> None:
+        for address in [a for a in self._mapped if not _is_buffer(_path(a))]:
             del self._mapped[address]
 
 
@@ -136,7 +137,7 @@ def _boot_id() -> str:
 
 
 def _path(address: str) -> Path:
-    """Where this host shows the slot's memory; raises SharedMemoryError for another address."""
+    """Where this host shows the memory; raises SharedMemoryError for any other address."""
     match = _ADDRESS.fullmatch(address)
     if not match or sys.platform != "linux":
         raise SharedMemoryError("no address of a slot")
@@ -145,7 +146,7 @@ def _path(address: str) -> Path:
     return Path("/proc") / match[2] / "fd" / match[3]
 
 
-def _is_slot(path: Path) -> bool:
+def _is_buffer(path: Path) -> bool:
     try:
         return str(path.readlink()).startswith(f"/memfd:{_NAME}")
     except OSError:
@@ -154,14 +155,14 @@ def _is_slot(path: Path) -> bool:
 
 def _map(address: str) -> memoryview:
     path = _path(address)
-    if not _is_slot(path):
+    if not _is_buffer(path):
         raise SharedMemoryError("another container or user")
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except OSError as error:
         raise SharedMemoryError(f"not to be opened: {error.strerror}") from error
     try:
-        # Opened, it cannot be swapped for another file; sealed, it cannot shrink.
+        # Once open it cannot be swapped for another file; sealed, it cannot shrink.
         sealed = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & _SEALS == _SEALS
         if not sealed or os.fstat(descriptor).st_size <= ALIGNMENT:
             raise SharedMemoryError("no sealed memory")
@@ -176,30 +177,30 @@ def _map(address: str) -> memoryview:
 
 
 def put(memory: memoryview, parts: Sequence[Part]) -> tuple[int, int] | None:
-    """Copy a message into memory, as (start, length); None where it does not fit.
+    """Copy a message into memory and return (start, length); None if it does not fit.
 
-    A last part that lies in this memory already stays there, and the others go before it.
+    A last part that lies in this memory already stays in place, and the others go before it.
     """
     length = sum(map(len, parts))
-    there = _place_in(memory, parts[-1])
-    start = 0 if there is None else there - (length - len(parts[-1]))
+    existing = _place_in(memory, parts[-1])
+    start = 0 if existing is None else existing - (length - len(parts[-1]))
     if start < 0 or start + length > len(memory):
         return None
     place = start
-    for part in parts if there is None else parts[:-1]:
+    for part in parts if existing is None else parts[:-1]:
         memory[place : place + len(part)] = part
         place += len(part)
     return start, length
 
 
 def room(memory: memoryview, size: int) -> memoryview | None:
-    """The last `size` bytes of memory, from a multiple of the alignment; None where it is short."""
+    """The last `size` bytes, starting at a multiple of the alignment; None if there are fewer."""
     start = (len(memory) - size) // ALIGNMENT * ALIGNMENT
     return memory[start : start + size] if start >= 0 else None
 
 
 def _place_in(memory: memoryview, part: Part) -> int | None:
-    """Where in memory a part lies; None where it lies elsewhere."""
+    """The offset of a part in memory; None if it lies elsewhere."""
     place = _address(part) - _address(memory)
     return place if place >= 0 and place + len(part) <= len(memory) else None
 

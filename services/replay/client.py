@@ -58,7 +58,7 @@ class ReplayWriter:
         num_shards: int = 1,
     ) -> None:
         name = _names(num_shards)[shard]
-        self._client = session.client(keys.insert(shard), name, lends=True)
+        self._client = session.client(keys.insert(shard), name, shared_memory=True)
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
         self.throttled = 0
@@ -134,7 +134,7 @@ class ReplayReader:
         in_lockstep = learner_step is not None
         self._shards = [
             ShardStream(
-                session.client(keys.sample(shard), name, lends=True),
+                session.client(keys.sample(shard), name, shared_memory=True),
                 name,
                 self._request,
                 1 if in_lockstep else requests_in_flight,

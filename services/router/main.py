@@ -8,7 +8,7 @@ from mrcdrl.common.config import load_transport
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
-from mrcdrl.common.transport import ROUTER_FILE, Refusals, Session
+from mrcdrl.common.transport import ROUTER_FILE, AccessLog, Session
 
 _TICK_S = 1.0
 
@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with ExitStack() as owned:
         if transport.key:
-            owned.enter_context(Refusals())
+            owned.enter_context(AccessLog())
         owned.enter_context(Session(transport, router_file=arguments.config))
         while not stop.wait(_TICK_S):
             heartbeat.worked()

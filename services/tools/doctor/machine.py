@@ -20,7 +20,7 @@ from mrcdrl.common.config import Config
 from mrcdrl.common.errors import SharedMemoryError
 from mrcdrl.common.runtime.process import ALLOCATOR, available_cores
 from mrcdrl.common.runtime.versions import installed
-from mrcdrl.common.transport.shared_memory import Slot
+from mrcdrl.common.transport.shared_memory import SharedBuffer
 from mrcdrl.services.replay.client import table_bytes
 from mrcdrl.services.tools.doctor.finding import Finding, failed, ok, warning
 
@@ -161,8 +161,8 @@ def shared_memory() -> Finding:
     check = "shared memory"
     mend = "large messages go over the network meanwhile; allow memfds of one user in /proc"
     try:
-        slot = Slot(1 << 20)
-        _, process, descriptor, _ = slot.address.split()
+        buffer = SharedBuffer(1 << 20)
+        _, process, descriptor, _ = buffer.address.split()
         path = f"/proc/{process}/fd/{descriptor}"
         command = [sys.executable, "-I", "-S", "-c", _OPENER, path]
         opened = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -1,10 +1,10 @@
-"""What is read out of Zenoh's log: each refusal, and nothing that only might be one."""
+"""The access log: each refusal in Zenoh's trace, and nothing that only looks like one."""
 
 import logging
 
 import pytest
 
-from mrcdrl.common.transport.access_log import Judge, _Counted
+from mrcdrl.common.transport.access_log import AccessLogParser, _Repeats
 
 MODULE = "zenoh::net::routing::interceptor::access_control"
 ACTOR = "2ffa on Interface(lo)+CertCommonName(actor)+Transport(Tls)+2ffa"
@@ -29,18 +29,18 @@ def line(text: str, *, module: str = MODULE, level: str = "TRACE", thread: str =
 
 
 def caching(flow: str, key: str, thread: str = "rx-1") -> list[str]:
-    """What Zenoh writes when it judges ahead."""
-    judged = [f"{ACTOR} is unauthorized to {kind} ({flow}) on {key}" for kind in KINDS]
-    lines = [f"ACL ({flow}): caching permissions for `{key}` ...", *judged]
+    """Zenoh's lines when it caches its decisions for a new key."""
+    decisions = [f"{ACTOR} is unauthorized to {kind} ({flow}) on {key}" for kind in KINDS]
+    lines = [f"ACL ({flow}): caching permissions for `{key}` ...", *decisions]
     return [line(text, thread=thread) for text in lines]
 
 
 def read(*lines: str) -> list[str]:
-    judge = Judge()
-    return [said for one in lines if (said := judge.read(one)) is not None]
+    parser = AccessLogParser()
+    return [message for one in lines if (message := parser.parse(one)) is not None]
 
 
-def test_judging_ahead_refuses_nobody() -> None:
+def test_caching_permissions_refuses_nobody() -> None:
     assert (
         read(*caching("ingress", "mrcdrl/r/weights"), *caching("egress", "mrcdrl/r/weights")) == []
     )
@@ -53,15 +53,15 @@ def test_a_refusal_names_role_message_and_key() -> None:
     ]
 
 
-def test_a_refusal_that_was_not_judged_ahead() -> None:
+def test_a_refusal_without_a_cached_permission() -> None:
     text = f"{ACTOR} is unauthorized to Put (ingress) on mrcdrl/r/weights"
     assert read(line(text)) == ["refused actor: Put on mrcdrl/r/weights"]
-    ahead = caching("ingress", "mrcdrl/r/weights")
-    assert read(*ahead, line(text)) == ["refused actor: Put on mrcdrl/r/weights"]
-    assert len(read(*ahead[:4], line(text, thread="rx-0"))) == 1
+    cached = caching("ingress", "mrcdrl/r/weights")
+    assert read(*cached, line(text)) == ["refused actor: Put on mrcdrl/r/weights"]
+    assert len(read(*cached[:4], line(text, thread="rx-0"))) == 1
 
 
-def test_what_is_allowed_and_what_goes_out_is_no_refusal() -> None:
+def test_what_is_allowed_and_what_goes_out_is_not_a_refusal() -> None:
     assert (
         read(
             line(f"{ACTOR} is authorized to Put (ingress) on mrcdrl/r/episodes/a"),
@@ -85,28 +85,28 @@ def test_a_handshake_that_failed() -> None:
     assert said == ["refused a connection: peer sent no certificates."]
 
 
-def test_other_warnings_are_handed_on() -> None:
+def test_other_warnings_are_passed_on() -> None:
     assert read(line("odd", module="zenoh::else", level="WARN")) == ["zenoh::else: odd"]
-    assert read("no line of a log\n", "\n") == ["no line of a log"]
+    assert read("not a log line\n", "\n") == ["not a log line"]
 
 
 def test_repetitions_are_counted(caplog: pytest.LogCaptureFixture) -> None:
-    counted = _Counted()
+    repeats = _Repeats()
     with caplog.at_level(logging.WARNING):
         for _ in range(1000):
-            counted.add("refused actor: Put on mrcdrl/r/weights")
-        counted.tell()
+            repeats.add("refused actor: Put on mrcdrl/r/weights")
+        repeats.flush()
     assert [record.message for record in caplog.records] == [
         "refused actor: Put on mrcdrl/r/weights",
-        "refused actor: Put on mrcdrl/r/weights (999 times more)",
+        "refused actor: Put on mrcdrl/r/weights (999 more times)",
     ]
 
 
 def test_a_flood_of_kinds_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    counted = _Counted()
+    repeats = _Repeats()
     with caplog.at_level(logging.WARNING):
         for number in range(10_000):
-            counted.add(f"refused actor: Put on {number}")
-        counted.tell()
+            repeats.add(f"refused actor: Put on {number}")
+        repeats.flush()
     assert len(caplog.records) <= 110
-    assert "refused more, of other kinds (9899 times more)" in caplog.text
+    assert "refused more requests, of other kinds (9899 more times)" in caplog.text

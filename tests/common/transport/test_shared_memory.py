@@ -1,4 +1,4 @@
-"""Memory that a client lends: large messages cross in it, and whatever is odd is refused."""
+"""Shared memory: large messages go through it, and anything odd is refused."""
 
 import mmap
 import os
@@ -15,7 +15,14 @@ from mrcdrl.common.config import TransportConfig
 from mrcdrl.common.errors import DeadlineError, SharedMemoryError, ThrottledError
 from mrcdrl.common.transport import Request, Server, Session, free_endpoint, queries
 from mrcdrl.common.transport.compression import compressed
-from mrcdrl.common.transport.shared_memory import LARGE_BYTES, Lender, Slot, Slots, put, room
+from mrcdrl.common.transport.shared_memory import (
+    LARGE_BYTES,
+    BufferPool,
+    OpenedBuffers,
+    SharedBuffer,
+    put,
+    room,
+)
 from tests.common.transport.test_transport import until_served
 
 _DEADLINE_S = 20.0
@@ -23,21 +30,21 @@ KEY = "mrcdrl/slots/query"
 LARGE = bytes(range(256)) * (LARGE_BYTES // 128)
 SMALL = b"small"
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="slots are for Linux")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="shared memory needs Linux")
 
 
 def test_two_ends_see_the_same_memory() -> None:
-    slot = Slot(1000)
-    memory = Slots().open(slot.address)
-    assert len(memory) == len(slot.memory) >= 1000
+    buffer = SharedBuffer(1000)
+    memory = OpenedBuffers().open(buffer.address)
+    assert len(memory) == len(buffer.memory) >= 1000
     memory[10:15] = b"hello"
-    assert slot.memory[10:15] == b"hello"
-    slot.memory[10] = ord("j")
+    assert buffer.memory[10:15] == b"hello"
+    buffer.memory[10] = ord("j")
     assert memory[10:15] == b"jello"
 
 
 def test_memory_begins_at_a_multiple_of_64() -> None:
-    address: int = np.frombuffer(Slot(1).memory, np.uint8).__array_interface__["data"][0]
+    address: int = np.frombuffer(SharedBuffer(1).memory, np.uint8).__array_interface__["data"][0]
     assert address % 64 == 0
 
 
@@ -45,34 +52,34 @@ def open_descriptors() -> int:
     return sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
-def test_nothing_is_left_of_a_slot() -> None:
+def test_nothing_is_left_of_a_buffer() -> None:
     before = open_descriptors()
     for _ in range(20):
-        slot, slots = Slot(1 << 20), Slots()
-        slots.open(slot.address)
-        del slot, slots
+        buffer, opened = SharedBuffer(1 << 20), OpenedBuffers()
+        opened.open(buffer.address)
+        del buffer, opened
     assert open_descriptors() == before
 
 
-def test_the_slots_of_many_clients_are_mapped_once() -> None:
-    slots, lent = Slots(), [Slot(10) for _ in range(100)]
-    mapped = [slots.open(slot.address) for slot in lent]
-    assert all(slots.open(s.address) is m for s, m in zip(lent, mapped, strict=True))
+def test_the_buffers_of_many_clients_are_mapped_once() -> None:
+    opened, shared = OpenedBuffers(), [SharedBuffer(10) for _ in range(100)]
+    mapped = [opened.open(buffer.address) for buffer in shared]
+    assert all(opened.open(s.address) is m for s, m in zip(shared, mapped, strict=True))
 
 
-def test_slots_of_the_dead_are_forgotten() -> None:
-    slots, slot, other = Slots(), Slot(10), Slot(10)
-    first = slot.address
-    slots.open(first)
-    del slot
-    slots.open(other.address)
+def test_buffers_of_dead_clients_are_forgotten() -> None:
+    opened, buffer, other = OpenedBuffers(), SharedBuffer(10), SharedBuffer(10)
+    first = buffer.address
+    opened.open(first)
+    del buffer
+    opened.open(other.address)
     with pytest.raises(SharedMemoryError):
-        slots.open(first)
+        opened.open(first)
 
 
-def foreign(slot: Slot, **parts: str) -> str:
+def foreign(buffer: SharedBuffer, **parts: str) -> str:
     names = ("boot", "process", "descriptor", "token")
-    fields = dict(zip(names, slot.address.split(), strict=True)) | parts
+    fields = dict(zip(names, buffer.address.split(), strict=True)) | parts
     return " ".join(fields[name] for name in names)
 
 
@@ -90,24 +97,24 @@ ODD = {
 @pytest.mark.parametrize("name", ODD)
 def test_an_odd_address_is_refused(name: str) -> None:
     change, reason = ODD[name]
-    slot = Slot(10)
+    buffer = SharedBuffer(10)
     with pytest.raises(SharedMemoryError, match=reason):
-        Slots().open(change(slot))
+        OpenedBuffers().open(change(buffer))
 
 
 def test_memory_that_could_shrink_under_its_reader_is_refused() -> None:
     descriptor = os.memfd_create("mrcdrl-slot", os.MFD_ALLOW_SEALING)
     try:
         os.ftruncate(descriptor, mmap.PAGESIZE)
-        unsealed = foreign(Slot(10), descriptor=str(descriptor))
+        unsealed = foreign(SharedBuffer(10), descriptor=str(descriptor))
         with pytest.raises(SharedMemoryError, match="no sealed memory"):
-            Slots().open(unsealed)
+            OpenedBuffers().open(unsealed)
     finally:
         os.close(descriptor)
 
 
 def test_a_message_is_put_around_what_lies_there_already() -> None:
-    memory = Slot(1000).memory
+    memory = SharedBuffer(1000).memory
     last = room(memory, 300)
     assert last is not None
     last[:] = b"z" * 300
@@ -119,7 +126,7 @@ def test_a_message_is_put_around_what_lies_there_already() -> None:
 
 
 def test_what_does_not_fit_is_not_put() -> None:
-    memory = Slot(1000).memory
+    memory = SharedBuffer(1000).memory
     assert put(memory, [bytes(len(memory) + 1)]) is None
     assert room(memory, len(memory) + 1) is None
     everything = room(memory, len(memory))
@@ -133,8 +140,8 @@ class Pair:
     def __init__(self, server_session: Session, client_session: Session) -> None:
         self.server: Server = server_session.server(KEY)
         until_served(client_session, KEY, self.server)
-        self.client = client_session.client(KEY, "the peer", lends=True)
-        self.lender: Lender = self.client._lender
+        self.client = client_session.client(KEY, "the peer", shared_memory=True)
+        self.pool: BufferPool = self.client._pool
         self.thread = ThreadPoolExecutor(1)
 
     def exchange(self, request: bytes, reply: bytes) -> tuple[bytes, bytes, Request]:
@@ -169,11 +176,11 @@ def test_the_first_exchange_tells_whether_memory_is_shared(
     caplog.set_level("INFO")
     got, answer, _ = pair.exchange(SMALL, SMALL)
     assert (got, answer) == (SMALL, SMALL)
-    assert pair.lender.near is True
+    assert pair.pool.near is True
     assert caplog.messages == ["large messages to and from the peer go through shared memory"]
 
 
-def test_large_messages_go_through_one_slot_both_ways(pair: Pair) -> None:
+def test_large_messages_go_through_one_buffer_both_ways(pair: Pair) -> None:
     pair.exchange(SMALL, SMALL)
     descriptors = set()
     for _ in range(5):
@@ -192,7 +199,7 @@ def test_where_it_is_switched_off_all_goes_over_the_network(pair: Pair) -> None:
         assert isinstance(asked.payload, bytes)
 
 
-def test_a_peer_that_cannot_open_a_slot_is_served_over_the_network(
+def test_a_peer_that_cannot_open_a_buffer_is_served_over_the_network(
     pair: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
@@ -214,13 +221,13 @@ def test_a_peer_that_cannot_open_a_slot_is_served_over_the_network(
     ]
 
 
-def test_a_slot_that_is_out_of_reach_later_makes_the_client_ask_over_the_network(
+def test_a_buffer_that_is_out_of_reach_later_makes_the_client_ask_over_the_network(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pair.exchange(SMALL, SMALL)
     with monkeypatch.context() as patched:
-        patched.setattr("mrcdrl.common.transport.shared_memory._is_slot", lambda _: False)
-        pair.server._slots = Slots()
+        patched.setattr("mrcdrl.common.transport.shared_memory._is_buffer", lambda _: False)
+        pair.server._buffers = OpenedBuffers()
         taken = pair.thread.submit(pair.server.take, _DEADLINE_S)
         pending = pair.client.ask(LARGE)
         assert taken.result() is None
@@ -231,7 +238,7 @@ def test_a_slot_that_is_out_of_reach_later_makes_the_client_ask_over_the_network
     assert isinstance(asked.payload, bytes)
 
 
-def test_a_slot_whose_answer_did_not_come_is_not_used_again(pair: Pair) -> None:
+def test_a_buffer_whose_answer_did_not_come_is_not_reused(pair: Pair) -> None:
     pair.exchange(SMALL, SMALL)
     pair.client._timeout_s = -0.9  # of our own wait: at once, whatever Zenoh does
     silent = pair.client.ask(LARGE)
@@ -248,10 +255,10 @@ def test_a_slot_whose_answer_did_not_come_is_not_used_again(pair: Pair) -> None:
 
 OTHER_PROCESS = f"""
 import sys
-from common.config import TransportConfig
-from common.transport import Session
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.transport import Session
 with Session(TransportConfig(connect=(sys.argv[1],))) as session:
-    client = session.client({KEY!r}, "the peer", lends=True)
+    client = session.client({KEY!r}, "the peer", shared_memory=True)
     for _ in range(3):
         pending = client.ask(bytes(range(256)) * 1000, reply_bytes=256_000)
         print(bytes(pending.result())[::-1] == bytes(range(256)) * 1000)

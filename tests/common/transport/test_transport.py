@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from mrcdrl.common.config import TransportConfig
 from mrcdrl.common.errors import (
@@ -102,7 +103,7 @@ def eventually(found: Callable[[], object]) -> None:
 
 
 def answer_next(server: Server, answer: str, text: str) -> bytes:
-    """Take one request, answer it by `reply`, `refuse` or `hold`, and return its payload."""
+    """Take one request, answer it by `reply`, `refuse` or `throttle`, and return its payload."""
     request = server.take(_DEADLINE_S)
     assert request is not None
     if answer == "reply":
@@ -122,7 +123,7 @@ def test_a_query_is_answered_across_the_router(network: Network) -> None:
         assert taken.result() == b"there"
 
 
-def test_several_queries_may_be_under_way(network: Network) -> None:
+def test_several_queries_may_be_in_flight(network: Network) -> None:
     server, client = network.pair()
     pending = [client.ask(str(number).encode()) for number in range(5)]
     requests = [server.take(_DEADLINE_S) for _ in pending]
@@ -141,10 +142,10 @@ def test_a_refusal_brings_its_reason(network: Network) -> None:
     assert not isinstance(refused.value, ThrottledError)
 
 
-def test_a_held_request_is_told_from_a_refused_one(network: Network) -> None:
+def test_a_throttled_request_differs_from_a_refused_one(network: Network) -> None:
     server, client = network.pair()
     with ThreadPoolExecutor(1) as other:
-        other.submit(answer_next, server, "hold", "not yet")
+        other.submit(answer_next, server, "throttle", "not yet")
         with pytest.raises(ThrottledError, match=r"^not yet$"):
             client.ask(b"").result()
 
@@ -195,7 +196,7 @@ def test_an_answer_that_is_too_large_is_refused(small_network: Network) -> None:
             client.ask(b"").result()
 
 
-def test_a_full_server_holds_further_requests(network: Network) -> None:
+def test_a_full_server_throttles_further_requests(network: Network) -> None:
     server, client = network.pair(capacity=1)
     first = client.ask(b"first")
     with pytest.raises(ThrottledError, match="1 requests are waiting"):
@@ -205,7 +206,9 @@ def test_a_full_server_holds_further_requests(network: Network) -> None:
     assert first.result() == b"done"
 
 
-def test_large_requests_that_wait_are_held_to_four_of_the_largest(small_network: Network) -> None:
+def test_large_requests_that_wait_are_limited_to_four_of_the_largest(
+    small_network: Network,
+) -> None:
     server = small_network.join().server(KEY)
     client = small_network.join().client(KEY, "the peer")
     waiting = [client.ask(b"x" * 900) for _ in range(4)]
@@ -280,7 +283,7 @@ def test_a_publication_that_is_too_large_is_counted_and_dropped(small_network: N
     assert (waiting.dropped, latest.oversized) == (1, 1)
 
 
-def test_presence_sees_who_is_there_already_who_comes_and_who_goes(network: Network) -> None:
+def test_presence_sees_tokens_held_already_new_ones_and_those_given_up(network: Network) -> None:
     first, second = KEYS.live("actor", "actor-0"), KEYS.live("actor", "actor-1")
     network.join().announce(first)
     presence = network.join().presence(KEYS.everyone("actor"))
@@ -434,7 +437,7 @@ def test_a_router_is_of_use_before_the_one_it_links_to_and_links_again_to_each_t
 
 @pytest.mark.parametrize("endpoint", ["tcp", "127.0.0.1:7447", "tcp/", ""])
 def test_a_malformed_endpoint_is_refused_at_once(endpoint: str) -> None:
-    with pytest.raises(EndpointError, match="is no endpoint"):
+    with pytest.raises(EndpointError, match="is not an endpoint"):
         Session(TransportConfig(connect=(endpoint,)))
 
 
@@ -465,7 +468,10 @@ def test_a_certificate_that_is_not_there_is_named(certificates: Path) -> None:
 
 @pytest.mark.parametrize(
     ("host", "level", "said"),
-    [("127.0.0.1", "INFO", "for this machine only"), ("0.0.0.0", "WARNING", "whoever reaches it")],
+    [
+        ("127.0.0.1", "INFO", "from this machine only"),
+        ("0.0.0.0", "WARNING", "anyone who can reach it"),
+    ],
 )
 def test_who_listens_in_the_clear_says_so(
     caplog: pytest.LogCaptureFixture, host: str, level: str, said: str
@@ -538,13 +544,61 @@ def test_a_client_whose_link_was_lost_goes_on_as_another() -> None:
             eventually(lambda: KEYS.live("actor", "a") in presence.alive())
 
 
-def test_closing_waits_for_no_router() -> None:
-    endpoint = free_endpoint()
+def renewing() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.name == "renew"}
+
+
+def test_closing_waits_for_no_router_and_joins_the_thread_that_renews() -> None:
+    endpoint, others = free_endpoint(), renewing()
     router = Session(TransportConfig(listen=(endpoint,)))
+    assert renewing() == others  # a router has nothing to renew
     session = Session(TransportConfig(connect=(endpoint,)))
     session.server(KEY)
-    router.close()
+    assert len(renewing() - others) == 1
+    router.close()  # the session now tries to connect again
     began_s = time.monotonic()
     session.close()
     assert time.monotonic() - began_s < _DEADLINE_S
     assert "closed" in repr(session)
+    assert renewing() == others
+
+
+def test_a_renewed_session_leaves_no_thread_either() -> None:
+    endpoint, others = free_endpoint(), renewing()
+    router = Session(TransportConfig(listen=(endpoint,)))
+    with Session(TransportConfig(connect=(endpoint,))) as session:
+        session.server(KEY)
+        for _ in range(2):
+            identity = session._session.zid()
+            router.close()
+            router = Session(TransportConfig(listen=(endpoint,)))
+            eventually(lambda lost=identity: session._session.zid() != lost)
+            assert len(renewing() - others) == 1
+    router.close()
+    assert renewing() == others
+
+
+def test_a_session_that_cannot_declare_everything_is_replaced_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    endpoint, config = free_endpoint(), TransportConfig(timeout_s=5.0)
+    router = Session(config.model_copy(update={"listen": (endpoint,)}))
+    with (
+        Session(config.model_copy(update={"connect": (endpoint,)})) as one,
+        Session(config.model_copy(update={"connect": (endpoint,)})) as other,
+    ):
+        server = one.server(KEY)
+        [declaration] = one._declarations
+        declare, failures = declaration.make, [1, 1]
+
+        def fail_twice(session: zenoh.Session) -> object:
+            if failures:
+                failures.pop()
+                raise zenoh.ZError("the link is lost")
+            return declare(session)
+
+        monkeypatch.setattr(declaration, "make", fail_twice)
+        router.close()
+        with Session(config.model_copy(update={"listen": (endpoint,)})):
+            until_served(other, KEY, server)
+            assert not failures
