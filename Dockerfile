@@ -48,7 +48,8 @@ RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
 # -- what all have: no root, one folder to keep runs in, health by the work that is done -------------
 
 FROM ${PYTHON} AS service
-ARG VERSION=0.1.0
+# Set by whoever builds for others; `mrcdrl.__version__` says what is installed.
+ARG VERSION=unknown
 ARG REVISION=unknown
 LABEL org.opencontainers.image.title="mrcdrl" \
       org.opencontainers.image.description="Distributed actor-learner for multi-robot coordination" \
@@ -57,7 +58,9 @@ LABEL org.opencontainers.image.title="mrcdrl" \
       org.opencontainers.image.revision="${REVISION}"
 RUN useradd --uid 10001 --user-group --no-create-home --home-dir /tmp mrcdrl \
  && install --directory --owner=mrcdrl --group=mrcdrl /runs /certs /var/cache/mrcdrl
+# PYTHONSAFEPATH: no file of the working directory is imported.
 ENV PATH=/opt/mrcdrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONSAFEPATH=1 \
     MRCDRL_HEARTBEAT=/tmp/heartbeat
 WORKDIR /
 USER mrcdrl

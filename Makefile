@@ -6,7 +6,7 @@ CONFIG ?= quick
 ROBOTS ?= 2
 ARGS ?=
 
-.PHONY: install train test lint format bench clean
+.PHONY: install train test lint format bench wheel clean
 
 install: $(VENV)/installed
 
@@ -36,5 +36,9 @@ format: install
 bench: install
 	for file in benchmarks/stages.py benchmarks/arena.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) $(ARGS) || exit 1; done
 
+# The source archive, and the wheel built from it, in dist/.
+wheel: install
+	$(BIN)/python -m build --no-isolation
+
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
