@@ -1,24 +1,24 @@
-"""Every error a caller may want to catch, drawn as one tree.
+"""The errors that a caller may want to catch, as one tree.
 
 MrcdrlError
 ├── ConfigError         a setting is unknown, impossible or contradicts another
-├── RunDirectoryError   a run's folder exists, is missing, or cannot be written
-├── CheckpointError     weights or a checkpoint cannot be read, are foreign or damaged
-├── DivergedError       learning led to numbers that are not finite: it would do so again
+├── RunDirectoryError   a run directory exists, is missing, or cannot be written
+├── CheckpointError     weights or a checkpoint are unreadable, damaged or of another network
+├── DivergedError       learning produced numbers that are not finite, and would again
 ├── WireError           bytes from a peer break the wire's schema (counted and dropped)
-└── TransportError      the network did not do what was asked
+└── TransportError      the network failed to do what was asked
     ├── EndpointError   an endpoint cannot be listened on or connected to
-    ├── DeadlineError   a wait ended; the message says whom it waited for
-    ├── SharedMemoryError       memory that a peer lends is out of reach: the network must do
-    └── RefusedError    the peer answered, and refused, with its reason
-        └── ThrottledError   the peer's rate limiter held the request: try the same again
+    ├── DeadlineError   a wait timed out; the message names the peer
+    ├── SharedMemoryError  a peer's shared buffer is out of reach; the network serves instead
+    └── RefusedError    the peer refused, and gave its reason
+        └── ThrottledError  the peer's rate limiter held the request; send it again
 """
 
 
 class MrcdrlError(Exception):
-    """Base of all errors raised on purpose; its text is one line, fit to be shown to a user."""
+    """Base of all errors raised on purpose; the message is one line, fit for a user."""
 
-    exit_code = 1  # of a process that it ends
+    exit_code = 1  # of the process that it ends
 
 
 class ConfigError(MrcdrlError):
@@ -26,15 +26,15 @@ class ConfigError(MrcdrlError):
 
 
 class RunDirectoryError(MrcdrlError):
-    """A run's folder exists already, is missing, or cannot be written."""
+    """A run directory exists already, is missing, or cannot be written."""
 
 
 class CheckpointError(MrcdrlError):
-    """Weights or a checkpoint cannot be read, are foreign or damaged."""
+    """Weights or a checkpoint are unreadable, damaged or of another network."""
 
 
 class DivergedError(MrcdrlError):
-    """Learning led to numbers that are not finite; a learner started again would diverge again."""
+    """Learning produced numbers that are not finite; a restarted learner would diverge again."""
 
     exit_code = 3
 
@@ -44,7 +44,7 @@ class WireError(MrcdrlError):
 
 
 class TransportError(MrcdrlError):
-    """The network did not do what was asked."""
+    """The network failed to do what was asked."""
 
 
 class EndpointError(TransportError):
@@ -52,16 +52,16 @@ class EndpointError(TransportError):
 
 
 class DeadlineError(TransportError):
-    """A wait ended without an answer; the message says whom it waited for."""
+    """A wait timed out without an answer; the message names the peer."""
 
 
 class SharedMemoryError(TransportError):
-    """Memory that a peer lends is out of reach; the message is the reason."""
+    """A peer's shared buffer is out of reach; the message is the reason."""
 
 
 class RefusedError(TransportError):
-    """The peer answered and refused; the message is its reason."""
+    """The peer refused; the message is its reason."""
 
 
 class ThrottledError(RefusedError):
-    """The peer's rate limiter held the request for as long as it may; try the same again."""
+    """The peer's rate limiter held the request as long as it may; send it again."""

@@ -1,6 +1,6 @@
-"""Joins a run that is up on this machine and plays its arena by the run's newest weights.
+"""Join a run that is up on this machine, and play its arena with the newest weights.
 
-`python examples/live_policy.py four` beside `mrcdrl train --name four`.
+Run `python examples/live_policy.py four` beside `mrcdrl train --name four`.
 """
 
 import sys

@@ -1,1 +1,1 @@
-"""What every process needs: signals, files, the heartbeat, names."""
+"""Process basics: signals, exit codes, atomic files, the heartbeat, names, versions."""

@@ -1,11 +1,11 @@
-"""What is closed when its `with` block is left."""
+"""The base of objects that close at the end of a `with` block."""
 
 from types import TracebackType
 from typing import Self
 
 
 class Closing:
-    """Enters as itself; leaving closes it, whatever happened."""
+    """A context manager that returns itself and calls `close` on exit, even after an error."""
 
     def __enter__(self) -> Self:
         return self
@@ -19,5 +19,5 @@ class Closing:
         self.close()
 
     def close(self) -> None:
-        """Give back what it holds."""
+        """Release what it holds."""
         raise NotImplementedError

@@ -1,7 +1,7 @@
-"""Files that are there wholly or not at all, and the weights kept in them.
+"""Atomic file writes, and the file names in a run directory that several rooms share.
 
-Invariants: a name is given to a file only when its bytes are on the disk; what a failed or
-killed write leaves behind never bears the final name; no torch here.
+Invariants: a file gets its name only when its bytes are on the disk; a write that fails or is
+killed leaves nothing under the final name.
 """
 
 import hashlib
@@ -9,14 +9,14 @@ import os
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".part"
-RUN_CONFIG = "config.toml"  # of a run's folder, like the next
+RUN_CONFIG = "config.toml"  # in a run directory, as BEST_WEIGHTS
 BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"
 
 
 def write_synced(path: Path, content: bytes, mode: int = 0o644) -> None:
     """Write a new file and wait until it is on the disk; raises OSError.
 
-    mode: who may read and write it, from its first byte on.
+    mode: the file's permissions, from its first byte on.
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
     try:
@@ -38,9 +38,9 @@ def sync_directory(path: Path) -> None:
 
 
 def atomic_write(path: Path, content: bytes, mode: int = 0o644) -> None:
-    """Write or replace a file in one step; on OSError the old one is as it was.
+    """Write or replace a file in one step; an OSError leaves the old one unchanged.
 
-    mode: as `write_synced` takes it. Two writers at once are safe, the last wins.
+    mode: as in `write_synced`. Two writers at once are safe: the last one wins.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
     try:
@@ -53,10 +53,10 @@ def atomic_write(path: Path, content: bytes, mode: int = 0o644) -> None:
 
 
 def sha256(content: bytes) -> str:
-    """Hexadecimal digest."""
+    """SHA-256 digest, in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
 def reason(error: OSError) -> str:
-    """Why, in a few words, such as "No space left on device"."""
+    """The reason in a few words, such as "No space left on device"."""
     return error.strerror or type(error).__name__

@@ -1,4 +1,4 @@
-"""Names of runs, workers and roles: they stand in key expressions and in file names."""
+"""Names of runs and workers, which become part of key expressions and file names."""
 
 import re
 
@@ -9,9 +9,10 @@ _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}")
 
 
 def check_name(name: str, what: str) -> str:
-    """`name`, or ConfigError where it would not stand in a key expression and a file name."""
+    """Return `name`; raises ConfigError if it does not fit key expressions and file names."""
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"{what} {name!r}: up to 64 letters, digits, '.', '_' and '-', a letter or digit first"
+            f"{what} {name!r}: use up to {MAX_NAME} ASCII letters, digits, '.', '_' and '-', "
+            "beginning with a letter or digit"
         )
     return name

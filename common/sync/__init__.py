@@ -1,1 +1,1 @@
-"""How a process joins a run and keeps up with it: configuration, weights, statistics."""
+"""Joining a run and keeping up with it: configuration, weights, statistics, lockstep."""

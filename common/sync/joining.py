@@ -1,4 +1,4 @@
-"""How a process joins a run: by its name, an endpoint, and the configuration that replay serves."""
+"""Joining a run: its name, its endpoint, and the configuration that its replay service serves."""
 
 import argparse
 import os
@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from mrcdrl.common.config import Config, TransportConfig, apply_overrides, load_transport
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
@@ -23,7 +24,7 @@ ENDPOINT_FILE = "endpoint"
 
 @dataclass(frozen=True, slots=True)
 class Joining:
-    """How a service finds its run."""
+    """What a process needs to join its run."""
 
     run: str
     worker: str
@@ -31,18 +32,31 @@ class Joining:
     transport: TransportConfig
     overrides: dict[str, str]
 
+    @classmethod
+    def from_argv(cls, role: str, argv: Sequence[str]) -> Self:
+        """Parse a service's command line; raises EndpointError as `from_arguments`."""
+        parser = joining_parser(role, f"Start the {role} of a run that is up.")
+        return cls.from_arguments(parser.parse_args(argv))
+
+    @classmethod
+    def from_arguments(cls, arguments: argparse.Namespace) -> Self:
+        """Read the flags of `joining_parser`.
+
+        Raises EndpointError if neither --connect nor the run directory names an endpoint.
+        """
+        run_dir = arguments.run_dir / check_name(arguments.run, "run name")
+        host_and_process = f"{socket.gethostname()}-{os.getpid()}"
+        worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", host_and_process)
+        given = overrides(arguments)
+        transport = load_transport(given)
+        endpoints = arguments.connect or transport.connect
+        endpoints = tuple(endpoints or [recorded_endpoint(run_dir, "--connect")])
+        transport = transport.model_copy(update={"connect": endpoints, "listen": ()})
+        return cls(arguments.run, check_name(worker, "--id"), run_dir, transport, given)
+
     @property
     def keys(self) -> Keys:
         return Keys(self.run)
-
-
-def joining_arguments(role: str, argv: Sequence[str]) -> Joining:
-    """A service's command line.
-
-    Raises EndpointError where neither --connect nor the run's folder names an endpoint.
-    """
-    parser = joining_parser(role, f"Start the {role} of a run that is up.")
-    return joining_of(parser.parse_args(argv))
 
 
 def joining_parser(command: str, description: str) -> Parser:
@@ -50,32 +64,16 @@ def joining_parser(command: str, description: str) -> Parser:
     parser = Parser(prog=f"mrcdrl {command}", description=description)
     parser.add_argument("--run", required=True, help="the run's name")
     parser.add_argument("--connect", action="append", help="endpoint, such as tcp/HOST:7447")
-    parser.add_argument("--id", help="this worker's name; by default from the host and process")
+    parser.add_argument("--id", help="this worker's name; default: from the host and process")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     add_config_flags(parser)
     return parser
 
 
-def joining_of(arguments: argparse.Namespace) -> Joining:
-    """What those flags say.
+def recorded_endpoint(run_dir: Path, flag: str) -> str:
+    """The endpoint of a run on this machine, as `mrcdrl train` recorded it.
 
-    Raises EndpointError where neither --connect nor the run's folder names an endpoint.
-    """
-    run_dir = arguments.run_dir / check_name(arguments.run, "run name")
-    worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", f"{socket.gethostname()}-{os.getpid()}")
-    given = overrides(arguments)
-    transport = load_transport(given)
-    endpoints = tuple(
-        arguments.connect or transport.connect or [noted_endpoint(run_dir, "--connect")]
-    )
-    transport = transport.model_copy(update={"connect": endpoints, "listen": ()})
-    return Joining(arguments.run, check_name(worker, "--id"), run_dir, transport, given)
-
-
-def noted_endpoint(run_dir: Path, flag: str) -> str:
-    """Where the run on this machine listens, as `mrcdrl train` wrote it down.
-
-    Raises EndpointError, naming the flag to give, where none is up.
+    Raises EndpointError, naming the flag to give, if no run is up there.
     """
     try:
         return (run_dir / ENDPOINT_FILE).read_text("utf-8").strip()
@@ -88,9 +86,9 @@ def noted_endpoint(run_dir: Path, flag: str) -> str:
 def fetch_config(
     session: Session, joining: Joining, stop: StopSignal, timeout_s: float = 30.0
 ) -> Config:
-    """The run's configuration, from its replay service, under this process's own settings.
+    """Ask replay for the run's configuration, and put this process's own settings over it.
 
-    Raises DeadlineError where nobody serves that run within the time.
+    Raises DeadlineError if nobody serves that run within the time.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)

@@ -1,11 +1,11 @@
-"""Acting by a run that is up: whoever holds a LivePolicy acts by the run's newest weights.
+"""Acting with the newest weights of a run that is up, from outside the run.
 
     with LivePolicy("four", "tcp/127.0.0.1:7447") as policy:
         actions = policy.act(images)  # uint8 [N, V, V] in, uint8 [N] out
 
-Invariants: weights only ever get newer; those that are torn, altered or of another network are
-counted and dropped; only `act` adopts, so that all actions of a call are by one version. For one
-thread. Nothing is sent but two questions: for the configuration, and for the first weights.
+Invariants: weights only ever get newer; weights that are torn, altered or of another network are
+counted and dropped; only `act` adopts, so that one version chooses all actions of a call. For one
+thread. It asks for the configuration, and for weights: the first, or after a long silence.
 """
 
 import contextlib
@@ -30,10 +30,10 @@ _LOG = logging.getLogger("live")
 
 
 class LivePolicy(Closing):
-    """Follows a run's weights and acts by them; use it in `with`.
+    """Follows a run's weights and acts with them; use it in a `with` block.
 
-    run: its name. endpoint: where its replay service listens, such as tcp/HOST:7447. epsilon:
-    share of actions drawn at random, by the seed. timeout_s: for each of the endpoint, the
+    run: the run's name. endpoint: its router or replay service, such as tcp/HOST:7447. epsilon:
+    probability of a random action. seed: of these actions. timeout_s: for each of the endpoint, the
     configuration and the first weights; DeadlineError or EndpointError says which did not come.
     """
 
@@ -68,7 +68,7 @@ class LivePolicy(Closing):
             self._opened = opened.pop_all()
 
     def close(self) -> None:
-        """Leave the run; again is harmless."""
+        """Leave the run; harmless if repeated."""
         self._opened.close()
 
     def __repr__(self) -> str:
@@ -76,28 +76,28 @@ class LivePolicy(Closing):
 
     @property
     def version(self) -> int:
-        """Of the weights acted by."""
+        """Version of the weights in use."""
         return self._policy.weights_version
 
     @property
     def staleness_s(self) -> float:
-        """Seconds since they came."""
+        """Seconds since these weights were adopted."""
         return time.monotonic() - self._adopted_s
 
     @property
     def refused(self) -> int:
-        """Weights that were torn, altered, too large or of another network."""
+        """Number of weights that were torn, altered, too large or of another network."""
         return self._reader.refused + self._foreign
 
     def begin(self, robots: NDArray[np.integer] | slice = slice(None)) -> None:
-        """An episode of these robots begins: their next images follow on no others."""
+        """Begin an episode of these robots: their next images start new stacks."""
         self._fresh[robots] = True
 
     def act(self, observations: UInt8Array) -> UInt8Array:
-        """Actions uint8 [N] of N robots by the newest weights: 0 left, 1 straight, 2 right.
+        """Choose actions uint8 [N] with the newest weights: 0 left, 1 straight, 2 right.
 
-        observations: what they see now, uint8 [N, V, V], which is stacked on what they saw
-        before; or whole states, uint8 [N, S, V, V]. Another N begins anew for all robots.
+        observations: the N robots' images, uint8 [N, V, V], which are stacked on their earlier
+        ones; or whole states, uint8 [N, S, V, V]. Another N starts new stacks for all robots.
         """
         newer = self._reader.latest()
         if newer is not None:
@@ -114,7 +114,7 @@ class LivePolicy(Closing):
         self._adopted_s = time.monotonic()
 
     def _stacked(self, images: UInt8Array) -> UInt8Array:
-        """States uint8 [N, S, V, V]; the first image of an episode stands for those before."""
+        """States uint8 [N, S, V, V]; an episode's first image also fills the frames before it."""
         if len(images) != len(self._fresh):
             arena = self.config.arena
             self._frames = FrameStack(len(images), arena.stack, arena.view_px)

@@ -1,9 +1,9 @@
-"""Actor and learner in turns, so that the numbers of a run do not depend on who is how fast.
+"""Lockstep: actor and learner take turns, so that a run's numbers do not depend on their speed.
 
 In turn t the one actor collects with the weights of learner step t x `steps`, in new episodes that
-end with the turn; then the learner makes `steps` steps. Invariant: whatever a process does follows
-from the configuration, the turn and the learner's checkpoint of its beginning, so that a process
-that is killed does the same again. Pure.
+end with the turn; then the learner makes `steps` steps. Invariant: everything that a process does
+follows from the configuration, the turn, and the learner's checkpoint at its beginning, so that a
+process that is killed repeats itself exactly. Pure.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from mrcdrl.common.config import Config
 
 @dataclass(frozen=True, slots=True)
 class Lockstep:
-    """first: transitions that turn 0 has more; size: of a turn; steps: of the learner in one."""
+    """The sizes of a turn."""
 
-    first: int
-    size: int
-    steps: int
+    first: int  # transitions that turn 0 has beyond `size`
+    size: int  # transitions of a turn
+    steps: int  # learner steps of a turn
 
     @classmethod
-    def of(cls, config: Config) -> Self | None:
-        """As configured; None where all go at their own pace."""
+    def from_config(cls, config: Config) -> Self | None:
+        """Lockstep as configured; None if actors and learner run freely."""
         size = config.run.turn_size
         if not size:
             return None
@@ -32,13 +32,13 @@ class Lockstep:
         return cls(first, size, samples // config.learner.batch_size)
 
     def turn(self, learner_step: int) -> int:
-        """In which the learner, having made so many steps, makes the next one."""
+        """The turn in which the learner makes the step after `learner_step` others."""
         return learner_step // self.steps
 
     def transitions(self, turn: int) -> int:
-        """That the actor collects in this turn."""
+        """Transitions that the actor collects in a turn."""
         return self.size + (0 if turn else self.first)
 
     def inserts(self, learner_step: int) -> int:
-        """Transitions ever inserted when the learner makes the step after so many."""
+        """Transitions inserted in all before the learner makes the step after `learner_step`."""
         return self.first + (self.turn(learner_step) + 1) * self.size

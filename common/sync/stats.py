@@ -20,7 +20,7 @@ class StatsReporter:
         self._role = role
         self._worker = worker
         self._text = {"incarnation": str(time.time_ns()), **versions()}
-        self._heartbeat = Heartbeat.of_environment()
+        self._heartbeat = Heartbeat.from_environment()
         self._due_s = 0.0
 
     def worked(self, at_s: float | None = None) -> None:

@@ -1,7 +1,7 @@
-"""Live weights: the learner publishes, whoever joins late asks once, everyone holds the newest.
+"""Live weights: the learner publishes, late joiners ask once, every reader keeps the newest.
 
-Invariants: what a reader returns only ever gets newer, by (epoch, version); a message that is
-torn, altered or foreign is counted and dropped. Bytes in, bytes out: nothing here knows torch.
+Invariants: a reader's weights only ever get newer, by (epoch, version); a message that is torn,
+altered or foreign is counted and dropped. Bytes in, bytes out: no torch here.
 """
 
 import contextlib
@@ -20,16 +20,16 @@ from mrcdrl.common.transport import PendingReply, Session
 from mrcdrl.common.transport.keys import Keys
 
 _LOG = logging.getLogger("weights")
-_TAKE_S = 0.2
-_ASK_AGAIN_S = 0.5
+_POLL_S = 0.2
+_RETRY_S = 0.5
 _SILENCE_S = 20.0
 
 
 class WeightsWriter:
-    """Publishes weights, and answers late joiners with the newest, from threads of its own.
+    """Publishes weights and answers late joiners with the newest, in two threads of its own.
 
-    A subscriber that hangs holds up the publishing thread only; what became old meanwhile is
-    left out.
+    A subscriber that hangs blocks the publishing thread only, which then skips versions that have
+    become old.
     """
 
     def __init__(self, session: Session, keys: Keys) -> None:
@@ -47,14 +47,14 @@ class WeightsWriter:
             thread.start()
 
     def publish(self, weights: Weights) -> None:
-        """Hand over the newest weights; returns at once."""
+        """Take the newest weights to be published; returns at once."""
         payload = encode(weights)
         with self._changed:
             self._newest = payload
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Publish what is still to be published, then end both threads."""
+        """Publish the newest weights if they are not yet, then end both threads."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -78,7 +78,7 @@ class WeightsWriter:
 
     def _serve(self) -> None:
         while not self._stopping:
-            request = self._server.take(_TAKE_S)
+            request = self._server.take(_POLL_S)
             if request is None:
                 continue
             if self._newest is None:
@@ -90,8 +90,8 @@ class WeightsWriter:
 class WeightsReader:
     """Follows the newest weights of a run.
 
-    silence_s: without a publication for so long, the learner is asked: a link that was out may
-    come back with all but its subscriptions.
+    silence_s: after this long without a publication the reader asks the learner, because a link
+    that was lost may come back without its subscriptions.
     """
 
     def __init__(self, session: Session, keys: Keys, *, silence_s: float = _SILENCE_S) -> None:
@@ -109,10 +109,10 @@ class WeightsReader:
         return self._refused + self._subscriber.oversized
 
     def latest(self, timeout_s: float = 0.0) -> Weights | None:
-        """Weights newer than the last returned; None where none came within the time."""
+        """Weights newer than any returned before; None if none came within the time."""
         published = self._subscriber.take(timeout_s)
         if published is None:
-            return self._newer(self._answer())
+            return self._newer(self._answer_after_silence())
         self._heard_s = time.monotonic()
         return self._newer(published)
 
@@ -122,27 +122,27 @@ class WeightsReader:
         timeout_s: float = math.inf,
         meanwhile: Callable[[], None] = lambda: None,
     ) -> Weights | None:
-        """The first weights, asked for and listened for; None when stopped, or after the time.
+        """Ask and listen for the first weights; None when stopped or out of time.
 
         meanwhile: called several times a second at best, every few seconds at worst.
         """
-        told, deadline = False, time.monotonic() + timeout_s
+        logged, deadline = False, time.monotonic() + timeout_s
         while not stop.is_set() and time.monotonic() < deadline:
-            weights = self._newer(self._ask()) or self.latest(_ASK_AGAIN_S)
+            weights = self._newer(self._ask()) or self.latest(_RETRY_S)
             if weights is not None:
                 return weights
-            if not told:
+            if not logged:
                 _LOG.info("waiting for the learner's first weights")
-                told = True
+                logged = True
             meanwhile()
         return None
 
-    def _answer(self) -> Part | None:
-        """To a question after a long silence, if it is there; asks where one is due."""
+    def _answer_after_silence(self) -> Part | None:
+        """The answer to a question asked after a long silence, if it has come; asks when due."""
         if self._asked is None:
             if time.monotonic() - self._heard_s >= self._silence_s:
                 self._heard_s = time.monotonic()
-                with contextlib.suppress(TransportError):  # asked again when it is due
+                with contextlib.suppress(TransportError):  # asked again when due
                     self._asked = self._client.ask(b"")
             return None
         if not self._asked.wait(0.0):

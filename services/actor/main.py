@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
-from mrcdrl.common.sync.joining import fetch_config, joining_arguments
+from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.transport import Session
 from mrcdrl.services.actor.actor import Actor
@@ -16,7 +16,7 @@ from mrcdrl.services.replay.client import ReplayWriter, shard_of
 
 def main(argv: Sequence[str]) -> int:
     """Collect for a run; the exit code."""
-    joining = joining_arguments("actor", argv)
+    joining = Joining.from_argv("actor", argv)
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
         config = fetch_config(session, joining, stop)
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
         sender = Sender(writer, config.actor.spool_chunks)
         lease = LeaseKeeper(session, joining.keys, joining.worker, config.exploration.lease_s)
         try:
-            actor, lockstep = Actor(config, joining, session, sender, lease), Lockstep.of(config)
+            actor, lockstep = Actor(config, joining, session, sender, lease), Lockstep.from_config(config)
             if lockstep is None:
                 actor.run(stop)
             else:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
-from mrcdrl.common.sync.joining import fetch_config, joining_arguments
+from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.evaluator import Evaluator
 
@@ -15,7 +15,7 @@ _NICE = 10  # judging gives way to learning where they share cores
 
 def main(argv: Sequence[str]) -> int:
     """Judge for a run; the exit code."""
-    joining = joining_arguments("evaluator", argv)
+    joining = Joining.from_argv("evaluator", argv)
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)

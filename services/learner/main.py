@@ -12,7 +12,7 @@ from mrcdrl.common.arena import layout_symmetries
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import Samples
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal, available_cores
-from mrcdrl.common.sync.joining import fetch_config, joining_arguments
+from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.sync.weights import WeightsWriter
@@ -35,7 +35,7 @@ _WAITING_BATCHES = 64  # whose priorities are not sent yet: some 40 ms of the fa
 
 def main(argv: Sequence[str]) -> int:
     """Learn for a run; the exit code."""
-    joining = joining_arguments("learner", argv)
+    joining = Joining.from_argv("learner", argv)
     keys, worker = joining.keys, joining.worker
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
         settings = config.learner
         torch.set_num_threads(1)  # threads share batches, not operations
         threads = settings.threads or max(1, available_cores() // 2)
-        lockstep = Lockstep.of(config)
+        lockstep = Lockstep.from_config(config)
         learner = Learner(
             config.agent,
             settings,
@@ -116,7 +116,7 @@ def run(
     of publishing or saving numbers that are not finite.
     """
     timer = StageTimer(learner, prefetcher, priorities, keeper, Diagnostics(config, learner))
-    limit, lockstep = config.run.learner_steps, Lockstep.of(config)
+    limit, lockstep = config.run.learner_steps, Lockstep.from_config(config)
     publish_period = config.learner.publish_period if lockstep is None else lockstep.steps
     interval_s = config.learner.publish_interval_s if lockstep is None else 0.0
     try:

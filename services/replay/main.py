@@ -14,7 +14,7 @@ from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
-from mrcdrl.common.sync.joining import noted_endpoint
+from mrcdrl.common.sync.joining import recorded_endpoint
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Server, Session
 from mrcdrl.common.transport.keys import Keys
@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     if not (listen or connect):
         listen, connect = config.transport.listen, config.transport.connect
     if not (listen or connect):
-        listen = (noted_endpoint(run_dir, "--listen"),)
+        listen = (recorded_endpoint(run_dir, "--listen"),)
     transport = config.transport.model_copy(update={"listen": listen, "connect": connect})
     keys, shard = Keys(arguments.run), arguments.shard
     if not 0 <= shard < config.replay.shards:

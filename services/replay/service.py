@@ -94,7 +94,7 @@ class ReplayService:
         self._snapshots = (
             None if log is None else SnapshotWriter(log.directory, self.snapshot, period_s)
         )
-        self._lockstep = Lockstep.of(config)
+        self._lockstep = Lockstep.from_config(config)
         self._book = SequenceBook()
         self._accepted: list[_Accepted] = []  # neither logged nor stored yet
         self._owed: list[tuple[_Request, InsertReply]] = []  # once all of them are

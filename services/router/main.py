@@ -36,7 +36,7 @@ def main(argv: Sequence[str]) -> int:
             "connect": tuple(arguments.connect or given.connect),
         }
     )
-    heartbeat = Heartbeat.of_environment()
+    heartbeat = Heartbeat.from_environment()
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with ExitStack() as owned:
         if transport.key:

@@ -12,7 +12,7 @@ from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.versions import PACKAGES
-from mrcdrl.common.sync.joining import fetch_config, joining_of, joining_parser
+from mrcdrl.common.sync.joining import Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
 from mrcdrl.services.monitor.bottleneck import limiting_stage
 from mrcdrl.services.monitor.display import display
@@ -33,7 +33,7 @@ Show = Callable[[], None]
 def main(argv: Sequence[str]) -> int:
     """Show, or keep the record, of a run; the exit code."""
     arguments = parser().parse_args(argv)
-    joining, stop = joining_of(arguments), StopSignal().listen()
+    joining, stop = Joining.from_arguments(arguments), StopSignal().listen()
     with ExitStack() as owned:
         session = owned.enter_context(Session(joining.transport))
         config = fetch_config(session, joining, stop)
@@ -54,7 +54,7 @@ def main(argv: Sequence[str]) -> int:
             else display(state, config, joining.run, lambda: follower.now)
         )
         # Of a service only: who looks at one from within its container must not beat for it.
-        heartbeat = Heartbeat.of_environment() if arguments.record else Heartbeat(None)
+        heartbeat = Heartbeat.from_environment() if arguments.record else Heartbeat(None)
         with showing as show:
             listen(follower, heartbeat, stop, show)
         if recorder is not None:

@@ -14,7 +14,7 @@ from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import EndpointError
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.common.sync.joining import joining_of
+from mrcdrl.common.sync.joining import Joining
 from mrcdrl.services.tools.doctor.finding import Finding, failed
 from mrcdrl.services.tools.doctor.machine import of_this_machine
 from mrcdrl.services.tools.doctor.run import look
@@ -55,7 +55,7 @@ def parser() -> Parser:
 def look_at_run(arguments: argparse.Namespace) -> tuple[list[Finding], Config | None]:
     """What was found of the run that the flags name, and its configuration."""
     try:
-        joining = joining_of(arguments)
+        joining = Joining.from_arguments(arguments)
     except EndpointError as error:
         return [failed("endpoint", str(error), "start the run, or give --connect")], None
     return look(joining, StopSignal())

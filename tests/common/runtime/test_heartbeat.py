@@ -1,4 +1,4 @@
-"""The heartbeat's file, and what is said of it."""
+"""The heartbeat's file, and the health check that reads it."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Heartbeat, Pulse, mai
 
 
 @pytest.mark.parametrize(
-    ("beat_s", "worked_s", "illness"),
+    ("beat_s", "worked_s", "problem"),
     [
         (100, 100, None),
         (71, 71, None),
@@ -21,9 +21,9 @@ from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Heartbeat, Pulse, mai
         (60, 20, "hung"),
     ],
 )
-def test_illness(beat_s: float, worked_s: float, illness: str | None) -> None:
-    found = Pulse(1, beat_s, worked_s).illness(100, 30)
-    assert found == illness or (illness and found and found.startswith(illness))
+def test_problem(beat_s: float, worked_s: float, problem: str | None) -> None:
+    found = Pulse(1, beat_s, worked_s).problem(100, 30)
+    assert found == problem or (problem and found and found.startswith(problem))
 
 
 def test_a_beat_is_read_back(tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_work_is_never_taken_back(tmp_path: Path) -> None:
     assert Pulse.read(tmp_path / "heartbeat").worked_s == 5e9
 
 
-def test_a_folder_that_is_gone_is_no_error(tmp_path: Path) -> None:
+def test_a_missing_directory_is_not_an_error(tmp_path: Path) -> None:
     Heartbeat(tmp_path / "gone" / "heartbeat").beat()
 
 
@@ -54,7 +54,7 @@ def test_without_a_file_named_nothing_is_written(
 ) -> None:
     monkeypatch.delenv(FILE_VARIABLE, raising=False)
     monkeypatch.chdir(tmp_path)
-    Heartbeat.of_environment().beat()
+    Heartbeat.from_environment().beat()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -68,7 +68,7 @@ def test_no_heartbeat_is_unhealthy(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     ("silent_s", "code", "alive"), [(0, 0, True), (60, 1, True), (200, 1, False)]
 )
-def test_what_hangs_is_killed(
+def test_a_process_that_hangs_is_killed(
     silent_s: float, code: int, alive: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "heartbeat"

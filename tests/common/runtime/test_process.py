@@ -6,7 +6,7 @@ import sys
 
 STUCK = """
 import sys, threading
-from common.process import StopSignal
+from mrcdrl.common.runtime.process import StopSignal
 stop = StopSignal().listen(int(sys.argv[1]))
 print("listening", flush=True)
 stop.wait(60)

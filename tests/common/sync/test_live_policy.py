@@ -22,7 +22,7 @@ from mrcdrl.common.transport.keys import Keys
 
 RUN = "followed"
 SMALL = {"arena.view_px": "32", "arena.max_frames": "20", "learner.precision": "float32"}
-EXAMPLE = Path(__file__).parents[2] / "examples" / "live_policy.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "live_policy.py"
 
 
 @dataclass(frozen=True, slots=True)

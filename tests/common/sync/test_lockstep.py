@@ -1,4 +1,4 @@
-"""Who is due to do what in a run that takes turns."""
+"""Turn sizes of a run in lockstep."""
 
 from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.sync.lockstep import Lockstep
@@ -11,8 +11,8 @@ OVERRIDES = {
 }
 
 
-def test_a_turn_is_so_many_transitions_and_the_steps_that_they_are_sampled_for() -> None:
-    lockstep = Lockstep.of(load_config("smoke", OVERRIDES, environ={}))
+def test_a_turn_has_its_transitions_and_the_steps_that_sample_them() -> None:
+    lockstep = Lockstep.from_config(load_config("smoke", OVERRIDES, environ={}))
     assert lockstep == Lockstep(
         first=208, size=64, steps=8
     )  # whole frames of 8 robots; 4 samples each
@@ -21,5 +21,5 @@ def test_a_turn_is_so_many_transitions_and_the_steps_that_they_are_sampled_for()
     assert [lockstep.inserts(step) for step in (0, 7, 8, 16)] == [272, 272, 336, 400]
 
 
-def test_by_default_all_go_at_their_own_pace() -> None:
-    assert Lockstep.of(Config()) is None
+def test_by_default_nothing_is_in_lockstep() -> None:
+    assert Lockstep.from_config(Config()) is None

@@ -34,7 +34,7 @@ def test_a_plain_name_is_taken(name: str) -> None:
     ],
 )
 def test_a_name_that_would_break_a_key_or_a_path_is_refused(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"run name .*letter or digit first"):
+    with pytest.raises(ConfigError, match=r"run name .*beginning with a letter or digit"):
         Keys(name)
 
 

@@ -64,7 +64,7 @@ def test_what_services_say_is_heard_and_is_work(tmp_path: Path) -> None:
     assert state.robot_steps == 5
     assert follower.lived_s > born_s
     heartbeat.beat()
-    assert Pulse.read(path).illness(Pulse.read(path).beat_s, 30.0) is None
+    assert Pulse.read(path).problem(Pulse.read(path).beat_s, 30.0) is None
 
 
 def test_a_run_that_is_recorded_is_locked(tmp_path: Path) -> None:
