@@ -1,1 +1,1 @@
-"""The actor: steps arenas by the newest weights and sends what happened to replay."""
+"""The actor: steps arenas with the newest weights and sends the transitions to replay."""

@@ -1,4 +1,7 @@
-"""`mrcdrl actor`: join a run, follow its weights, collect, until told to stop."""
+"""`mrcdrl actor`: collect transitions with the newest weights of a run.
+
+`Actor` goes at its own pace, `LockstepActor` collects once for each turn of the learner.
+"""
 
 import logging
 import time
@@ -10,6 +13,7 @@ import numpy as np
 from mrcdrl.common.arena import make_arenas, make_codec
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.metrics import ActorMetrics
 from mrcdrl.common.messages.trajectory import Chunk, EpisodeSummary, Float32Array, Weights
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.model.exploration import epsilons
@@ -23,7 +27,7 @@ from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session
 from mrcdrl.services.actor.chunker import ChunkerConfig
 from mrcdrl.services.actor.collector import Collector
-from mrcdrl.services.actor.lease import WHOLE_LADDER, LeaseKeeper, Place
+from mrcdrl.services.actor.lease import ALONE, ExplorationRank, LeaseClient
 from mrcdrl.services.actor.sender import Sender
 
 _LOG = logging.getLogger("actor")
@@ -31,7 +35,7 @@ _LISTEN_S = 0.2
 
 
 class Actor:
-    """The shell around a collector."""
+    """The shell around a collector; it collects at its own pace."""
 
     def __init__(
         self,
@@ -39,7 +43,7 @@ class Actor:
         joining: Joining,
         session: Session,
         sender: Sender,
-        lease: LeaseKeeper,
+        lease: LeaseClient,
     ) -> None:
         keys, worker = joining.keys, joining.worker
         self._config = config
@@ -54,47 +58,28 @@ class Actor:
         self._policy = make_policy(config, resolve_device(config.actor.device, "actor.device"))
         self._collector = make_collector(config, worker, self._policy)
         self._adopted_s = time.monotonic()
-        self._epsilons = self._explore(lease.place)
+        self._epsilons = self._explore(lease.rank)
         self._waited_s = 0.0
         self._refused = 0  # weights of another network
         self._started_s = time.monotonic()
 
     def run(self, stop: StopSignal) -> None:
-        """Follow, step, send, tell, until stopped."""
+        """Wait for the first weights, then collect until stopped."""
         self._adopt(self._reader.wait(stop, meanwhile=self._report))
-        self._epsilons = self._explore(self._lease.place)
+        self._epsilons = self._explore(self._lease.rank)
         while not stop.is_set():
-            self._follow()
-            self._tell(*self._collector.step(self._epsilons), stop)
+            self._advance(stop)
         self._reporter.now(self._metrics)
 
-    def run_in_lockstep(self, lockstep: Lockstep, stop: StopSignal) -> None:
-        """Collect once for the weights of each turn, until stopped."""
-        self._adopt(self._reader.wait(stop, meanwhile=self._report))
-        done = -1
-        while not stop.is_set():
-            turn = lockstep.turn(self._policy.learner_step)
-            if turn > done and self._policy.weights_version >= 0:
-                self._take_turn(turn, lockstep.transitions(turn), stop)
-                done = turn
-            self._sender.check()
-            self._adopt(self._reader.latest(_LISTEN_S))
-            self._report()
-        self._reporter.now(self._metrics)
+    def _advance(self, stop: StopSignal) -> None:
+        """Adopt newer weights, step every arena once, send the result."""
+        self._adopt_newer()
+        self._send(*self._collector.step(self._epsilons), stop)
 
-    def _take_turn(self, turn: int, transitions: int, stop: StopSignal) -> None:
-        collector = make_collector(self._config, self._worker, self._policy, turn)
-        collector.go_on_counting(self._collector)
-        self._collector, self._epsilons = collector, self._explore(WHOLE_LADDER)
-        for left in reversed(range(transitions // collector.num_robots)):
-            if stop.is_set():
-                return
-            self._tell(*collector.step(self._epsilons, breaks_off=not left), stop)
-
-    def _tell(
+    def _send(
         self, chunks: Sequence[Chunk], episodes: Sequence[EpisodeSummary], stop: StopSignal
     ) -> None:
-        """Spool the chunks, publish the episodes."""
+        """Spool the chunks, publish the episode summaries, report."""
         began_s = time.monotonic()
         self._sender.put_all(chunks, stop, self._report_waiting)
         self._waited_s += time.monotonic() - began_s
@@ -112,15 +97,15 @@ class Actor:
         self._reporter.worked()
         self._reporter.maybe(self._metrics)
 
-    def _follow(self) -> None:
-        """Adopt newer weights, and explore as their step and the place on the ladder say."""
+    def _adopt_newer(self) -> None:
+        """Adopt newer weights; update epsilon when they or the exploration rank changed."""
         adopted = self._adopt(self._reader.latest())
         self._lease.follow()
-        if adopted or self._lease.place != self._place:
-            self._epsilons = self._explore(self._lease.place)
+        if adopted or self._lease.rank != self._rank:
+            self._epsilons = self._explore(self._lease.rank)
 
     def _adopt(self, weights: Weights | None) -> bool:
-        """Act by these weights from now on, unless there are none or they are foreign."""
+        """Act by these weights from now on; False for None and for another network's weights."""
         if weights is None:
             return False
         try:
@@ -132,47 +117,85 @@ class Actor:
         self._adopted_s = time.monotonic()
         return True
 
-    def _explore(self, place: Place) -> Float32Array:
-        """Epsilon of each arena."""
-        self._place = place
+    def _explore(self, rank: ExplorationRank) -> Float32Array:
+        """Epsilon of each arena at this exploration rank."""
+        self._rank = rank
         return epsilons(
             self._config.exploration,
             self._policy.learner_step,
-            *place,
+            *rank,
             self._config.actor.num_arenas,
         )
 
-    def _metrics(self) -> dict[str, float]:
+    def _metrics(self) -> ActorMetrics:
         collector, seconds = self._collector, self._collector.seconds
         now = time.monotonic()
         lived_s = max(now - self._started_s, 1e-9)
-        return {
-            "env_steps": collector.env_steps,
-            "robot_steps": collector.robot_steps,
-            "episodes": collector.num_episodes,
-            "chunks": self._sender.chunks,
-            "inserts_acknowledged": self._sender.transitions,
-            "spool_chunks": self._sender.spooled,
-            "weights_version": self._policy.weights_version,
-            "weights_age_s": now - self._adopted_s,
-            "weights_refused": self._reader.refused + self._refused,
-            "slot": self._lease.slot,
-            "epsilon_min": float(self._epsilons.min()),
-            "epsilon_max": float(self._epsilons.max()),
-            "inference_share": seconds.inference / lived_s,
-            "arena_share": seconds.arena / lived_s,
-            "draw_share": seconds.draw / lived_s,
-            "chunk_share": seconds.chunk / lived_s,
-            "wait_share": self._waited_s / lived_s,
-        }
+        return ActorMetrics(
+            env_steps=collector.env_steps,
+            robot_steps=collector.robot_steps,
+            episodes=collector.num_episodes,
+            chunks=self._sender.chunks,
+            inserts_acknowledged=self._sender.transitions,
+            spool_chunks=self._sender.spooled,
+            weights_version=self._policy.weights_version,
+            weights_age_s=now - self._adopted_s,
+            weights_refused=self._reader.refused + self._refused,
+            slot=self._lease.slot,
+            epsilon_min=float(self._epsilons.min()),
+            epsilon_max=float(self._epsilons.max()),
+            inference_share=seconds.inference / lived_s,
+            arena_share=seconds.arena / lived_s,
+            draw_share=seconds.draw / lived_s,
+            chunk_share=seconds.chunk / lived_s,
+            wait_share=self._waited_s / lived_s,
+        )
+
+
+class LockstepActor(Actor):
+    """Collects once with the weights of each turn, then waits for the next turn's."""
+
+    def __init__(
+        self,
+        config: Config,
+        joining: Joining,
+        session: Session,
+        sender: Sender,
+        lease: LeaseClient,
+        lockstep: Lockstep,
+    ) -> None:
+        super().__init__(config, joining, session, sender, lease)
+        self._lockstep = lockstep
+        self._done = -1  # the last turn collected
+
+    def _advance(self, stop: StopSignal) -> None:
+        """Collect if a new turn has begun, then listen for weights."""
+        turn = self._lockstep.turn(self._policy.learner_step)
+        if turn > self._done and self._policy.weights_version >= 0:
+            self._collect(turn, stop)
+            self._done = turn
+        self._sender.check()
+        self._adopt(self._reader.latest(_LISTEN_S))
+        self._report()
+
+    def _collect(self, turn: int, stop: StopSignal) -> None:
+        """Make the turn's transitions in new episodes, as if this were the only actor."""
+        collector = make_collector(self._config, self._worker, self._policy, turn)
+        collector.continue_counts(self._collector)
+        self._collector, self._epsilons = collector, self._explore(ALONE)
+        for left in reversed(range(self._lockstep.transitions(turn) // collector.num_robots)):
+            if stop.is_set():
+                return
+            self._send(*collector.step(self._epsilons, truncate=not left), stop)
 
 
 def make_collector(
     config: Config, worker: str, policy: Policy, turn: int | None = None
 ) -> Collector:
-    """Arenas, codec and chunkers for one actor; its seeds differ by its name.
+    """Build the arenas, codec and chunkers of one actor; its name enters the seeds.
 
-    turn: of a run that takes turns; they differ by it too, and the chunks are known again by it.
+    turn: in lockstep, enters the seeds too, and is the incarnation, so that chunks of a turn that
+    is repeated are recognised.
     """
     name_entropy = int.from_bytes(worker.encode(), "little")
     entropy = [config.run.seed, name_entropy, *([] if turn is None else [turn])]
@@ -183,20 +206,12 @@ def make_collector(
         [np.random.default_rng(seed) for seed in arena_seeds],
         [arena_identity(worker, index) for index in range(config.actor.num_arenas)],
     )
-    origin = ChunkerConfig(
-        actor=worker,
-        incarnation=time.time_ns() if turn is None else turn,
-        gamma=config.agent.gamma,
-        n_step=config.agent.n_step,
-        stack=config.arena.stack,
-        chunk_length=config.actor.chunk_length,
-        prioritized=config.replay.prioritized,
-        reward_scale=config.agent.reward_scale,
-    )
+    incarnation = time.time_ns() if turn is None else turn
+    chunking = ChunkerConfig.from_config(config, worker, incarnation)
     codec = make_codec(config.arena)
-    return Collector(config, origin, arenas, codec, policy, np.random.default_rng(policy_seed))
+    return Collector(config, chunking, arenas, codec, policy, np.random.default_rng(policy_seed))
 
 
 def arena_identity(worker: str, arena: int) -> int:
-    """What the images of a counting arena carry, in 16 bits: which of whose arenas it is."""
+    """16-bit identity of one actor's arena, which the images of a counting arena carry."""
     return (zlib.crc32(worker.encode()) + arena) % 2**16

@@ -1,32 +1,29 @@
-"""From one robot's steps to chunks that stand alone: history before, n-step returns, bootstrap.
+"""Cuts one robot's steps into self-contained chunks: history, n-step returns, bootstrap states.
 
 Invariants: every step becomes exactly one transition, in order, in exactly one chunk; n-step
-returns are summed here and nowhere else; pure.
+returns are summed here only; pure.
 
     R_t = sum_{i<k} gamma^i r_{t+i},   discount_t = gamma^k, or 0 if the episode terminated there,
     k = min(n, steps left in the episode)
 
-Initial priorities are the TD errors of the values the actions were chosen by (Ape-X, section 3):
+Initial priorities are TD errors, from the values the actions were chosen by (Ape-X, section 3):
 
     p_t = |scale R_t + discount_t max_a Q(s_{t+k}, a) - Q(s_t, a_t)|
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import Chunk, Float32Array, UInt8Array
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkerConfig:
-    """Who makes the chunks, and how they are cut.
-
-    prioritized: whether chunks bear priorities; they are then cut one step later, when the value
-    of their last bootstrap is known. reward_scale: of the TD errors, as in the learner.
-    """
+    """The actor that makes the chunks, and how they are cut."""
 
     actor: str
     incarnation: int
@@ -34,16 +31,30 @@ class ChunkerConfig:
     n_step: int
     stack: int
     chunk_length: int
+    # Chunks with priorities are cut one step later, when the last bootstrap's value is known.
     prioritized: bool = False
-    reward_scale: float = 1.0
+    reward_scale: float = 1.0  # scales rewards in the TD errors, as in the learner
+
+    @classmethod
+    def from_config(cls, config: Config, actor: str, incarnation: int) -> Self:
+        return cls(
+            actor,
+            incarnation,
+            gamma=config.agent.gamma,
+            n_step=config.agent.n_step,
+            stack=config.arena.stack,
+            chunk_length=config.actor.chunk_length,
+            prioritized=config.replay.prioritized,
+            reward_scale=config.agent.reward_scale,
+        )
 
 
 class Chunker:
-    """The stream of one robot; `start` at each episode, `add` at each step."""
+    """The stream of one robot: `start` at each episode, `add` at each step."""
 
-    def __init__(self, origin: ChunkerConfig) -> None:
-        self._origin = origin
-        self._history = origin.stack - 1
+    def __init__(self, config: ChunkerConfig) -> None:
+        self._config = config
+        self._history = config.stack - 1
         self._records: list[UInt8Array] = []
         self._actions: list[int] = []
         self._rewards: list[float] = []
@@ -53,13 +64,13 @@ class Chunker:
 
     def start(self, record: UInt8Array) -> None:
         """Begin an episode with its first record, uint8 [R], repeated to fill the first state."""
-        self._records = [record] * self._origin.stack
+        self._records = [record] * self._config.stack
         for column in self._columns:
             column.clear()
 
     @property
     def _columns(self) -> tuple[list[Any], ...]:
-        """What there is one of for each step."""
+        """The lists with one item per step."""
         return (self._actions, self._rewards, self._versions, self._taken_q, self._greedy_q)
 
     def add(
@@ -75,10 +86,10 @@ class Chunker:
         discount: float,
         sequence: Iterator[int],
     ) -> list[Chunk]:
-        """One step: the action, its reward and the record after it; the chunks now complete.
+        """Add a step, its reward and the record uint8 [R] after it; return the chunks now complete.
 
-        taken_q, greedy_q: values of the action and of the best one, in the state before. discount:
-        of the step, 0 where the episode terminated. sequence: the actor's next numbers.
+        taken_q, greedy_q: values of this action and of the best one, in the state before the step.
+        discount: 0 if the episode terminated at this step. sequence: the actor's next numbers.
         """
         self._records.append(record)
         self._actions.append(action)
@@ -88,30 +99,30 @@ class Chunker:
         self._greedy_q.append(greedy_q)
         if last:
             return self._finish(discount, sequence)
-        length, n = self._origin.chunk_length, self._origin.n_step
-        if len(self._actions) < length + n - 1 + self._origin.prioritized:
+        length, n = self._config.chunk_length, self._config.n_step
+        if len(self._actions) < length + n - 1 + self._config.prioritized:
             return []
         return [self._cut(length, discount=1.0, sequence=sequence)]
 
     def _finish(self, discount: float, sequence: Iterator[int]) -> list[Chunk]:
-        """All steps left of an episode that ended; its last record is repeated as a tail."""
-        self._records += [self._records[-1]] * (self._origin.n_step - 1)
+        """Cut all remaining steps of an ended episode; its last record is repeated as a tail."""
+        self._records += [self._records[-1]] * (self._config.n_step - 1)
         chunks = []
         while self._actions:
-            length = min(self._origin.chunk_length, len(self._actions))
+            length = min(self._config.chunk_length, len(self._actions))
             chunks.append(self._cut(length, discount=discount, sequence=sequence))
         return chunks
 
     def _cut(self, length: int, *, discount: float, sequence: Iterator[int]) -> Chunk:
-        """The first `length` steps as a chunk; what later steps need of them stays."""
-        origin = self._origin
+        """Cut the first `length` steps into a chunk; keep the records that later steps need."""
+        config = self._config
         rewards, discounts, offsets = self._returns(length, discount)
         chunk = Chunk(
-            actor=origin.actor,
-            incarnation=origin.incarnation,
+            actor=config.actor,
+            incarnation=config.incarnation,
             sequence=next(sequence),
             weights_version=min(self._versions[:length]),
-            records=np.stack(self._records[: self._history + length + origin.n_step]),
+            records=np.stack(self._records[: self._history + length + config.n_step]),
             actions=np.array(self._actions[:length], np.uint8),
             rewards=rewards,
             discounts=discounts,
@@ -125,11 +136,11 @@ class Chunker:
     def _returns(
         self, length: int, discount: float
     ) -> tuple[Float32Array, Float32Array, UInt8Array]:
-        """n-step returns, discounts and offsets of the first `length` steps.
+        """n-step returns, discounts and bootstrap offsets of the first `length` steps.
 
-        discount: of the episode's end, where a return reaches it.
+        discount: for the returns that reach the episode's end.
         """
-        gamma, n = self._origin.gamma, self._origin.n_step
+        gamma, n = self._config.gamma, self._config.n_step
         steps = np.arange(length)
         offsets = np.minimum(n, len(self._actions) - steps)
         rewards = np.zeros(length + n, np.float64)
@@ -147,17 +158,17 @@ class Chunker:
     def _priorities(
         self, rewards: Float32Array, discounts: Float32Array, offsets: UInt8Array
     ) -> Float32Array:
-        """Absolute TD errors of the first transitions, [len(rewards)], or [0] if none are due.
+        """Absolute TD errors of the first transitions, [len(rewards)]; [0] if not prioritized.
 
-        Nobody acts in an episode's last state, so its value is not known; where the episode was
-        truncated, and only there it counts, the value of the state before stands for it.
+        No action is taken in an episode's last state, so its value is unknown. It only matters
+        after a truncation; the value of the state before it is used instead.
         """
-        if not self._origin.prioritized:
+        if not self._config.prioritized:
             return np.empty(0, np.float32)
         length = len(rewards)
         bootstraps = np.minimum(np.arange(length) + offsets, len(self._greedy_q) - 1)
         taken_q = np.array(self._taken_q[:length], np.float32)
         next_q = np.array(self._greedy_q, np.float32)[bootstraps]
-        errors = np.float32(self._origin.reward_scale) * rewards + discounts * next_q - taken_q
+        errors = np.float32(self._config.reward_scale) * rewards + discounts * next_q - taken_q
         priorities: Float32Array = np.abs(errors)
         return priorities

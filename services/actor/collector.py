@@ -1,7 +1,7 @@
-"""Many arenas stepped together: one batched inference for all of their robots.
+"""Steps many arenas together, with one batched inference for all of their robots.
 
-Invariants: the policy sees images drawn from the very records that go to replay; no thread,
-clock for decisions, or transport; each arena's exploration is its own.
+Invariants: the policy sees images rendered from the very records that go to replay; no threads, no
+transport, no decisions by the clock; each arena explores independently.
 """
 
 import time
@@ -25,7 +25,7 @@ from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
 
 @dataclass(slots=True)
 class Seconds:
-    """Where a collector's time went, since the start."""
+    """Seconds that a collector has spent on each stage, since the start."""
 
     inference: float = 0.0
     arena: float = 0.0
@@ -35,7 +35,7 @@ class Seconds:
 
 @dataclass(slots=True)
 class _Episode:
-    """What is counted of an episode under way."""
+    """Sums over an episode in progress."""
 
     rewards: float = 0.0
     greedy_q: float = 0.0
@@ -45,25 +45,25 @@ class _Episode:
 
 
 class Collector:
-    """Steps arenas by a policy; `step` returns the chunks and episodes that are complete."""
+    """Steps arenas by a policy; `step` returns the completed chunks and episodes."""
 
     def __init__(
         self,
         config: Config,
-        origin: ChunkerConfig,
+        chunking: ChunkerConfig,
         arenas: ArenaBatch | CountingBatch,
         codec: ObservationCodec,
         policy: Policy,
         rng: np.random.Generator,
     ) -> None:
-        self._origin = origin
+        self._actor = chunking.actor
         self._arenas = arenas
         self._codec = codec
         self._policy = policy
         self._rng = rng
         self._num_robots = config.arena.num_robots
         self._chunkers = [
-            [Chunker(origin) for _ in range(self._num_robots)] for _ in range(len(arenas))
+            [Chunker(chunking) for _ in range(self._num_robots)] for _ in range(len(arenas))
         ]
         self._frames = FrameStack(self.num_robots, config.arena.stack, config.arena.view_px)
         self._sequence: Iterator[int] = iter(range(2**62))
@@ -75,20 +75,20 @@ class Collector:
 
     @property
     def num_robots(self) -> int:
-        """Of all arenas: transitions of one step."""
+        """Robots in all arenas, and so transitions per step."""
         return len(self._arenas) * self._num_robots
 
     @property
     def robot_steps(self) -> int:
-        """Transitions made."""
+        """Transitions collected so far."""
         return self.env_steps * self._num_robots
 
     def step(
-        self, epsilons: Float32Array, *, breaks_off: bool = False
+        self, epsilons: Float32Array, *, truncate: bool = False
     ) -> tuple[list[Chunk], list[EpisodeSummary]]:
-        """One step of every arena, arena e exploring with epsilons[e].
+        """Step every arena once, arena e exploring with epsilons[e].
 
-        breaks_off: the last one; what is left of all episodes is chunked, as if truncated here.
+        truncate: this is the last step; the episodes are chunked to here, as if truncated.
         """
         started = time.perf_counter()
         per_robot = np.repeat(epsilons, self._num_robots)
@@ -104,7 +104,7 @@ class Collector:
             chunk
             for index, time_step in enumerate(time_steps)
             for chunk in self._add(
-                index, actions[index], taken_q[index], greedy_q[index], time_step, breaks_off
+                index, actions[index], taken_q[index], greedy_q[index], time_step, truncate
             )
         ]
         mean_q = greedy_q.mean(axis=1)
@@ -127,8 +127,8 @@ class Collector:
         self.seconds.draw += time.perf_counter() - chunked
         return chunks, summaries
 
-    def go_on_counting(self, before: "Collector") -> None:
-        """From what another one counted before."""
+    def continue_counts(self, before: "Collector") -> None:
+        """Continue the counters of a previous collector."""
         self.seconds = before.seconds
         self.env_steps, self.num_episodes = before.env_steps, before.num_episodes
 
@@ -139,7 +139,7 @@ class Collector:
         taken_q: Float32Array,
         greedy_q: Float32Array,
         time_step: TimeStep,
-        breaks_off: bool,
+        truncate: bool,
     ) -> Iterator[Chunk]:
         for robot, chunker in enumerate(self._chunkers[index]):
             yield from chunker.add(
@@ -149,7 +149,7 @@ class Collector:
                 taken_q=float(taken_q[robot]),
                 greedy_q=float(greedy_q[robot]),
                 weights_version=max(self._policy.weights_version, 0),
-                last=time_step.last or breaks_off,
+                last=time_step.last or truncate,
                 discount=time_step.discount,
                 sequence=self._sequence,
             )
@@ -171,7 +171,7 @@ class Collector:
         self._episodes[index] = _Episode()
         self.num_episodes += 1
         return EpisodeSummary(
-            actor=self._origin.actor,
+            actor=self._actor,
             arena=index,
             episode=self.num_episodes,
             outcome=time_step.outcome,

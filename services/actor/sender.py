@@ -1,7 +1,7 @@
-"""A bounded spool between the arenas and replay, emptied by a thread of its own.
+"""A bounded spool between the arenas and replay, emptied by its own thread.
 
-Invariants: chunks leave in order, all that wait at once; none is dropped: a full spool makes `put`
-wait, which is how replay's rate limiter holds the arenas back.
+Invariants: chunks leave in order, all waiting chunks in one request; none is dropped. A full spool
+makes `put` wait, which is how replay's rate limiter throttles the arenas.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ class Sender:
 
     @property
     def spooled(self) -> int:
-        """Chunks not acknowledged yet."""
+        """Chunks waiting to be sent."""
         return self._spool.qsize()
 
     @property
@@ -40,9 +40,9 @@ class Sender:
         return self._writer.heard_s
 
     def put(self, chunk: Chunk, timeout_s: float) -> bool:
-        """Spool the chunk; False where there was no room within the time.
+        """Spool the chunk; False if there was no room within the time.
 
-        Raises the error that ended the sending: replay refused a chunk, and why.
+        Raises the error that stopped the sender, such as RefusedError with replay's reason.
         """
         self.check()
         try:
@@ -52,16 +52,16 @@ class Sender:
         return True
 
     def check(self) -> None:
-        """Raise the error that ended the sending, if one did."""
+        """Raise the error that stopped the sender, if one did."""
         if self._error is not None:
             raise self._error
 
     def put_all(
         self, chunks: Sequence[Chunk], stop: StopSignal, meanwhile: Callable[[], None]
     ) -> None:
-        """Spool them in order; when stopped, none after the first for which there is no room.
+        """Spool them in order; once stopped, give up at the first for which there is no room.
 
-        meanwhile: called several times a second while there is none.
+        meanwhile: called several times a second while there is no room.
         """
         for chunk in chunks:
             while not self.put(chunk, _POLL_S):
@@ -70,7 +70,7 @@ class Sender:
                 meanwhile()
 
     def close(self) -> None:
-        """Send what is spooled if replay takes it at once, then end the thread."""
+        """Send the spooled chunks if replay accepts them at once, then end the thread."""
         self._closing.set()
         self._thread.join()
 
@@ -87,7 +87,7 @@ class Sender:
                     chunks.append(self._spool.get_nowait())
             try:
                 reply = self._writer.insert(chunks)
-            except Exception as error:  # noqa: BLE001  raised again by put, in the owner's thread
+            except Exception as error:  # noqa: BLE001  re-raised by put, in the owner's thread
                 self._error = error
                 return
             if reply is None:

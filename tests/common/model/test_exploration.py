@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mrcdrl.common.config import ExplorationConfig
 from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.errors import ConfigError
-from mrcdrl.common.model.exploration import epsilons, ladder_exponents
+from mrcdrl.common.model.exploration import epsilons, epsilon_exponents
 
 PAPER = ((0, 1.0), (800_000, 0.1))
 
@@ -28,19 +28,19 @@ def test_a_schedule_of_several_points_or_one() -> None:
 
 
 def test_a_single_arena_has_exponent_one() -> None:
-    assert ladder_exponents(1, 0, 1, 8.0).tolist() == [1.0]
+    assert epsilon_exponents(1, 0, 1, 8.0).tolist() == [1.0]
 
 
 def test_actors_interleave() -> None:
-    assert ladder_exponents(2, 0, 2, 4.0).tolist() == [1.0, 3.0]
-    assert ladder_exponents(2, 1, 2, 4.0).tolist() == [2.0, 4.0]
+    assert epsilon_exponents(2, 0, 2, 4.0).tolist() == [1.0, 3.0]
+    assert epsilon_exponents(2, 1, 2, 4.0).tolist() == [2.0, 4.0]
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(1.0, 10.0))
 def test_all_arenas_together_are_evenly_spread(
     num_actors: int, num_arenas: int, power: float
 ) -> None:
-    each = [ladder_exponents(num_actors, r, num_arenas, power) for r in range(num_actors)]
+    each = [epsilon_exponents(num_actors, r, num_arenas, power) for r in range(num_actors)]
     total = num_actors * num_arenas
     expected = np.linspace(1.0, power, total) if total > 1 else np.ones(1)
     np.testing.assert_allclose(np.sort(np.concatenate(each)), expected, rtol=1e-9)
@@ -49,7 +49,7 @@ def test_all_arenas_together_are_evenly_spread(
 @pytest.mark.parametrize("rank", [-1, 3])
 def test_a_rank_outside_the_actors_is_refused(rank: int) -> None:
     with pytest.raises(ConfigError, match="rank"):
-        ladder_exponents(3, rank, 8, 3.0)
+        epsilon_exponents(3, rank, 8, 3.0)
 
 
 def test_epsilons_of_both_kinds() -> None:

@@ -43,8 +43,8 @@ def run(
     values: of the action and of the best one in each state that was acted in; chunks bear
     priorities if they are given.
     """
-    origin = ChunkerConfig("a", 9, gamma, n_step, stack, chunk_length, bool(values), reward_scale)
-    chunker, sequence = Chunker(origin), iter(range(1000))
+    config = ChunkerConfig("a", 9, gamma, n_step, stack, chunk_length, bool(values), reward_scale)
+    chunker, sequence = Chunker(config), iter(range(1000))
     steps = itertools.count()
     chunks: list[Chunk] = []
     for episode in episodes:

@@ -87,11 +87,11 @@ def make_network() -> QNetwork:
 
 def collect(steps: int, *, prioritized: bool = False) -> Collected:
     policy = WatchedPolicy(Policy(make_network()))
-    origin = ChunkerConfig("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
+    chunking = ChunkerConfig("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
     arenas = CountingBatch(CONFIG.arena, range(ARENAS))
     collector = Collector(
         CONFIG,
-        origin,
+        chunking,
         arenas,
         make_codec(CONFIG.arena),
         policy,  # type: ignore[arg-type]
@@ -109,9 +109,9 @@ def collect(steps: int, *, prioritized: bool = False) -> Collected:
     return Collected(collector, policy, chunks, summaries)
 
 
-def test_a_step_that_breaks_off_leaves_nothing_behind() -> None:
+def test_a_step_that_truncates_leaves_nothing_behind() -> None:
     collected = collect(9)
-    chunks, summaries = collected.collector.step(EPSILONS, breaks_off=True)
+    chunks, summaries = collected.collector.step(EPSILONS, truncate=True)
     num_robots = collected.collector.num_robots
     assert num_robots == ARENAS * ROBOTS
     assert sum(map(len, collected.chunks + chunks)) == 10 * num_robots

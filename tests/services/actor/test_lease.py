@@ -15,7 +15,7 @@ from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseRequest
 from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.actor.lease import WHOLE_LADDER, LeaseKeeper
+from mrcdrl.services.actor.lease import ALONE, ExplorationRank, LeaseClient
 from mrcdrl.services.replay.leases import LeaseTable
 from tests.system.system_processes import REPOSITORY, Command, end_all, eventually, run_name
 
@@ -37,10 +37,10 @@ class Network:
     def start_replay(self, now: float) -> None:
         self.table, self.now = LeaseTable(LEASE_S, 0, now), now
 
-    def join(self, actor: str) -> LeaseKeeper:
+    def join(self, actor: str) -> LeaseClient:
         session = Session(TransportConfig(connect=(self.endpoint,)))
         self.sessions.append(session)
-        return LeaseKeeper(session, self.keys, actor, RENEWED_S)
+        return LeaseClient(session, self.keys, actor, RENEWED_S)
 
     def answer(self) -> None:
         """What has been asked."""
@@ -48,16 +48,16 @@ class Network:
             wish = decode(LeaseRequest, request.payload)
             request.reply(encode(self.table.answer(wish, self.now)))
 
-    def until(self, keepers: Sequence[LeaseKeeper], places: Sequence[tuple[int, int]]) -> None:
-        """Actors work on until they are in these places."""
+    def until(self, clients: Sequence[LeaseClient], ranks: Sequence[ExplorationRank]) -> None:
+        """Actors work on until they have these ranks."""
 
         def settled() -> bool:
-            for keeper in keepers:
-                keeper.follow()
+            for client in clients:
+                client.follow()
             self.answer()
-            return [keeper.place for keeper in keepers] == list(places)
+            return [client.rank for client in clients] == list(ranks)
 
-        eventually(settled, f"places {places}", pause_s=0.001)
+        eventually(settled, f"ranks {ranks}", pause_s=0.001)
 
     def close(self) -> None:
         for session in (*self.sessions, self.router):
@@ -71,7 +71,7 @@ def network() -> Iterator[Network]:
     opened.close()
 
 
-def test_actors_that_ask_at_once_have_places_of_their_own(network: Network) -> None:
+def test_actors_that_ask_at_once_get_different_ranks(network: Network) -> None:
     first, second = network.join("a"), network.join("b")
     eventually(lambda: asked_by(network, first, second), "both have asked")
     network.until([first, second], [(first.slot, 2), (second.slot, 2)])
@@ -79,12 +79,12 @@ def test_actors_that_ask_at_once_have_places_of_their_own(network: Network) -> N
     assert {first.slot, second.slot} == {0, 1}
 
 
-def asked_by(network: Network, *keepers: LeaseKeeper) -> bool:
+def asked_by(network: Network, *clients: LeaseClient) -> bool:
     """Whether all have asked and been answered; each asks once in that."""
-    for keeper in keepers:
-        keeper.follow()
+    for client in clients:
+        client.follow()
     network.answer()
-    return all(keeper.slot != NO_SLOT for keeper in keepers)
+    return all(client.slot != NO_SLOT for client in clients)
 
 
 def test_a_slot_given_back_is_the_next_ones(network: Network) -> None:
@@ -109,16 +109,16 @@ def test_holders_keep_their_slots_when_replay_starts_again(network: Network) -> 
     newcomer = network.join("c")
     network.until([second], [(0, 1)])
     assert second.slot == 1, "by its claim: nobody else has claimed yet"
-    network.until([first, second, newcomer], [(0, 2), (1, 2), WHOLE_LADDER])
+    network.until([first, second, newcomer], [(0, 2), (1, 2), ALONE])
     network.now += LEASE_S / 2
-    network.until([first, second, newcomer], [(0, 2), (1, 2), WHOLE_LADDER])
-    for keeper in (first, second):  # as they do all the time
-        renewed_until(network, keeper)
+    network.until([first, second, newcomer], [(0, 2), (1, 2), ALONE])
+    for client in (first, second):  # as they do all the time
+        renewed_until(network, client)
     network.now += LEASE_S / 2
     network.until([first, second, newcomer], [(0, 3), (1, 3), (2, 3)])
 
 
-def renewed_until(network: Network, keeper: LeaseKeeper) -> None:
+def renewed_until(network: Network, client: LeaseClient) -> None:
     """Work on until it has been answered at the time that it is."""
     seen = network.table.answer
     answered: list[str] = []
@@ -128,7 +128,7 @@ def renewed_until(network: Network, keeper: LeaseKeeper) -> None:
         return seen(request, now)
 
     network.table.answer = answer  # type: ignore[method-assign]
-    eventually(lambda: keeper.follow() or network.answer() or answered, "it renews")
+    eventually(lambda: client.follow() or network.answer() or answered, "it renews")
 
 
 def test_without_replay_an_actor_waits_for_nothing_but_at_its_end() -> None:
@@ -137,46 +137,46 @@ def test_without_replay_an_actor_waits_for_nothing_but_at_its_end() -> None:
         Session(TransportConfig(listen=(endpoint,))),
         Session(TransportConfig(connect=(endpoint,))) as session,
     ):
-        keeper = LeaseKeeper(session, Keys("nobody"), "a", RENEWED_S)
+        client = LeaseClient(session, Keys("nobody"), "a", RENEWED_S)
         for _ in range(1000):
-            keeper.follow()
-        assert (keeper.place, keeper.slot) == (WHOLE_LADDER, NO_SLOT)
-        keeper.give_back()
+            client.follow()
+        assert (client.rank, client.slot) == (ALONE, NO_SLOT)
+        client.give_back()
 
 
 def test_an_answer_that_is_none_is_passed_over(network: Network) -> None:
-    keeper = network.join("a")
+    client = network.join("a")
 
     def refused() -> bool:
-        keeper.follow()
+        client.follow()
         request = network.server.take(0.01)
         if request is not None:
             request.reply(b"\x80")
         return request is not None
 
     eventually(refused, "it asks")
-    network.until([keeper], [(0, 1)])
+    network.until([client], [(0, 1)])
 
 
 HOLDER = """
 import sys, time
-from common.config import TransportConfig
-from common.keys import Keys
-from common.process import StopSignal
-from common.transport import Session
-from services.actor.lease import LeaseKeeper
+from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.actor.lease import LeaseClient
 endpoint, run, name, lease_s = sys.argv[1:]
 stop = StopSignal().listen(30)
 with Session(TransportConfig(connect=(endpoint,))) as session:
-    keeper = LeaseKeeper(session, Keys(run), name, float(lease_s))
+    client = LeaseClient(session, Keys(run), name, float(lease_s))
     while not stop.wait(0.02):
-        keeper.follow()
-        now, slot = time.monotonic(), keeper.slot
+        client.follow()
+        now, slot = time.monotonic(), client.slot
         if slot >= 0:
             print(now, slot, flush=True)
         else:
             print("none", flush=True)
-    keeper.give_back()
+    client.give_back()
 """
 
 
@@ -263,6 +263,6 @@ def test_no_two_processes_hold_a_slot_whatever_happens_to_them(tmp_path: Path) -
         for holder in holders:
             holder.end()
         end_all(run)
-    spans = sorted((s[2], s[0], s[1]) for holder in holders for s in holder.throttled())
+    spans = sorted((s[2], s[0], s[1]) for holder in holders for s in holder.held())
     for (slot, _, ended), (next_slot, began, _) in pairwise(spans):
         assert slot != next_slot or ended < began, f"two held slot {slot} at once"

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseReply, LeaseRequest
-from mrcdrl.services.actor.lease import WHOLE_LADDER, HeldLease
+from mrcdrl.services.actor.lease import ALONE, Lease
 from mrcdrl.services.replay.leases import LeaseTable
 
 LEASE_S = 10.0
@@ -92,18 +92,18 @@ def test_after_a_start_holders_claim_their_slots_before_others_get_any() -> None
 
 
 def test_an_actor_loses_its_slot_by_its_own_clock() -> None:
-    lease = HeldLease("a", 1)
-    assert lease.place(0) == WHOLE_LADDER
+    lease = Lease("a", 1)
+    assert lease.rank(0) == ALONE
     lease.take(LeaseReply(3, 2, 5, LEASE_S), asked_s=100)
-    assert (lease.slot(108.9), lease.place(108.9)) == (3, (2, 5))
+    assert (lease.slot(108.9), lease.rank(108.9)) == (3, (2, 5))
     assert lease.request(106, ANSWER_S).holds
     assert not lease.request(108, ANSWER_S).holds, "it may be over when the claim arrives"
-    assert (lease.slot(109), lease.place(109)) == (NO_SLOT, WHOLE_LADDER)
+    assert (lease.slot(109), lease.rank(109)) == (NO_SLOT, ALONE)
     assert lease.request(109, ANSWER_S).slot == 3, "what it would have again"
 
 
 def test_an_answer_that_was_long_under_way_gives_nothing() -> None:
-    lease = HeldLease("a", 1)
+    lease = Lease("a", 1)
     lease.take(LeaseReply(3, 2, 5, LEASE_S), asked_s=0)
     assert lease.slot(60) == NO_SLOT
 
@@ -125,7 +125,7 @@ class Actor:
 
     name: str
     rate: float  # of its clock
-    lease: HeldLease
+    lease: Lease
     under_way: list[Asked] = field(default_factory=list)
 
 
@@ -138,7 +138,7 @@ class LeasesAgainstTime(RuleBasedStateMachine):
         self.now_s = 0.0
         self.num_places, self.rate = num_places, rate
         self.started, self.tables = 2, 1
-        self.actors = [Actor("a", 1.0, HeldLease("a", 1)), Actor("b", 0.97, HeldLease("b", 2))]
+        self.actors = [Actor("a", 1.0, Lease("a", 1)), Actor("b", 0.97, Lease("b", 2))]
         self.table = opened(num_places)
 
     @rule()
@@ -150,7 +150,7 @@ class LeasesAgainstTime(RuleBasedStateMachine):
     @rule(name=st.sampled_from("abc"), rate=st.floats(0.96, 1.04))
     def start_actor(self, name: str, rate: float) -> None:
         self.started += 1
-        self.actors.append(Actor(name, rate, HeldLease(name, self.started)))
+        self.actors.append(Actor(name, rate, Lease(name, self.started)))
 
     @precondition(lambda self: self.actors)
     @rule(data=st.data())
@@ -217,7 +217,7 @@ class LeasesAgainstTime(RuleBasedStateMachine):
                 self.renew(actor)
         for actor in self.actors:
             self.renew(actor)
-        places = [actor.lease.place(actor.rate * self.now_s) for actor in self.actors]
+        places = [actor.lease.rank(actor.rate * self.now_s) for actor in self.actors]
         if not self.num_places:
             assert sorted(places) == [(rank, len(places)) for rank in range(len(places))]
         holders = sum(actor.lease.slot(actor.rate * self.now_s) >= 0 for actor in self.actors)
