@@ -1,7 +1,9 @@
-"""Set before torch is imported: its threads wait for one another when tests share the cores."""
+"""Fixtures for all tests, and settings for cores that tests share."""
 
 import datetime
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,14 +11,34 @@ from hypothesis import settings
 
 from mrcdrl.services.tools.certs import HOSTS, ROLES
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-settings.register_profile("shared cores", deadline=None)  # a wait for a core is no slow example
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is first imported
+settings.register_profile("shared cores", deadline=None)  # waiting for a core is not a slow example
 settings.load_profile("shared cores")
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Run PyTorch on one thread: threads on busy cores wait for each other, 100 times slower."""
+    import torch  # not at the top: most tests do without it
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def cpp_compiler() -> str:
+    """The machine's C++ compiler, for the GPU kernels' source, which is C++ as well."""
+    found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if found is None:
+        pytest.skip("NO C++ COMPILER: GPU KERNELS ARE NOT TESTED")
+    return found
 
 
 @pytest.fixture(scope="session")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of an authority and all roles, as `mrcdrl certs` makes it."""
+    """A directory with an authority and all roles, as `mrcdrl certs` makes it."""
     from mrcdrl.services.tools.certificates import make  # only here is cryptography needed
 
     folder = tmp_path_factory.mktemp("certificates")

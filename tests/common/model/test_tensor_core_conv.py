@@ -6,7 +6,6 @@ that runs a block's threads as threads of the system.
 
 import ctypes
 import logging
-import shutil
 import subprocess
 from collections.abc import Callable
 from functools import cache
@@ -37,11 +36,10 @@ LAYOUTS = [Layout(4, 60), Layout(1, 31), Layout(3, 34)]
 
 
 @pytest.fixture(scope="module")
-def on_a_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Layout], FirstLayer]:
+def on_a_cpu(
+    cpp_compiler: str, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[Layout], FirstLayer]:
     """The kernels of a layout, compiled for the CPU; in two blocks at most."""
-    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("NO C++ COMPILER HERE: the GPU's first layer is not tested")
     folder = tmp_path_factory.mktemp("kernels")
     (folder / "first_layer.cu").write_text(first_layer_source(), "utf-8")
 
@@ -52,7 +50,7 @@ def on_a_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Layout], Fir
         options += ["-shared", "-fPIC", "-pthread", f'-DFIRST_LAYER="{folder}/first_layer.cu"']
         macros = [f"-D{name}={value}" for name, value in layout.definitions.items()]
         source = str(HERE / "first_layer_on_a_cpu.cpp")
-        command = [compiler, *options, *macros, source, "-o", str(library)]
+        command = [cpp_compiler, *options, *macros, source, "-o", str(library)]
         built = subprocess.run(command, capture_output=True, text=True, check=False)
         assert built.returncode == 0, built.stderr
         functions = ctypes.CDLL(str(library))

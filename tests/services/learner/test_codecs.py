@@ -4,7 +4,6 @@ from itertools import count
 
 import numpy as np
 import pytest
-import torch
 
 from mrcdrl.common.arena import make_codec
 from mrcdrl.common.config import Config, load_config
@@ -15,6 +14,7 @@ from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.main import make_collate
 from mrcdrl.services.replay.build import build
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 NUM_STEPS = 5
 
 
@@ -51,7 +51,6 @@ def collect(config: Config, learner: Learner, num_transitions: int) -> list[Chun
 
 def learned(codec: str, sampler: str) -> bytes:
     """The parameters after some steps on what was collected."""
-    torch.set_num_threads(1)
     config = config_of(codec, sampler)
     learner = Learner(config.agent, config.learner, stack=4, view_px=config.arena.view_px)
     table, _ = build(config)

@@ -6,7 +6,6 @@ that stay where they are: all but the recording itself is what runs on a GPU.
 
 import dataclasses
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 from unittest.mock import MagicMock
@@ -28,15 +27,8 @@ from mrcdrl.services.learner.prefetch import Prefetcher
 from mrcdrl.services.learner.weights_publisher import Keeper
 from tests.services.learner.test_learner import FLOAT32, VIEW_PX, random_batch
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 14
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 class Replay:

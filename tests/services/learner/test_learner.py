@@ -1,7 +1,6 @@
 """The learner learns what is known to be right, and goes on exactly where it was."""
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -14,17 +13,9 @@ from mrcdrl.common.messages.trajectory import Float32Array
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.learner import Learner
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 VIEW_PX = 31
 FLOAT32 = LearnerConfig(precision="float32", device="cpu")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Two threads on cores that others use wait for each other: a hundred times slower."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def make_learner(

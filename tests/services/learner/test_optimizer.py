@@ -12,9 +12,9 @@ from mrcdrl.common.model.q_network import Kind, QNetwork, Trace
 from mrcdrl.services.learner.accelerate.data_parallel import Slices
 from mrcdrl.services.learner.accelerate.optimizer import Descent, gradients, leaves
 from mrcdrl.services.learner.learner import Learner
-from tests.services.learner.test_learner import VIEW_PX, one_thread, random_batch
+from tests.services.learner.test_learner import VIEW_PX, random_batch
 
-__all__ = ["one_thread"]  # for all tests here
+pytestmark = pytest.mark.usefixtures("one_thread")
 SIZE = 9  # of a batch, which no number of threads below divides
 
 

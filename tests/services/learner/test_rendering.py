@@ -5,7 +5,6 @@ No GPU needs to be here: its kernel's source is C++ as well, which the machine's
 
 import ctypes
 import logging
-import shutil
 import subprocess
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -50,16 +49,8 @@ CONFIGS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def compiler() -> str:
-    found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    if found is None:
-        pytest.skip("NO C++ COMPILER HERE: the GPU's drawing is not tested")
-    return found
-
-
 @pytest.fixture
-def compiled(compiler: str, tmp_path: Path) -> Any:
+def compiled(cpp_compiler: str, tmp_path: Path) -> Any:
     """A configuration's kernel for the CPU."""
 
     def compile_for(config: ArenaConfig) -> Paint:
@@ -67,7 +58,7 @@ def compiled(compiler: str, tmp_path: Path) -> Any:
         source.write_text(renderer_source(), "utf-8")
         macros = [f"-D{name}={value}" for name, value in definitions(config).items()]
         options = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
-        command = [compiler, *options, *macros, str(source), "-o", str(library)]
+        command = [cpp_compiler, *options, *macros, str(source), "-o", str(library)]
         built = subprocess.run(command, capture_output=True, text=True, check=False)
         assert built.returncode == 0, built.stderr
         draw = ctypes.CDLL(str(library)).draw

@@ -28,13 +28,10 @@ PUBLISH_PERIOD = 5
 
 
 @pytest.fixture(autouse=True)
-def deterministic() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+def deterministic(one_thread: None) -> Iterator[None]:
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
-    torch.set_num_threads(threads)
 
 
 def config_of(sampler: str) -> Config:
