@@ -1,16 +1,16 @@
-"""Faults in random order on a run whose services have hosts of their own, in two networks.
+"""Random faults on a run whose services each have their own host, in two networks.
 
-`python -m benchmarks.chaos --minutes 20 --seed 0 --actors 4` kills, stops and cuts off each service
-and lets it back, loses packets of its host and slows its links, fills disks and moves clocks, each
-kind on each service that can have it before any comes again. The same seed gives the same faults in
-the same order. Two networks, joined by two linked routers (tests/chaos/chaos_stack.py).
+`python -m benchmarks.chaos --minutes 20 --seed 0 --actors 4` kills, suspends and disconnects each
+service and lets it recover, drops its host's packets and slows its links, fills disks and shifts
+clocks. Every applicable kind hits every service once before any repeats. The same seed gives the
+same faults in the same order. Two linked routers join the networks (tests/chaos/chaos_stack.py).
 
-Prints a line for each fault, and in the end one line of JSON: `works_again_s`, from the end of a
-fault to the moment when its service has done more of its work, and was heard of over the network;
-`all_work_again_s`, the slowest of all services; `lost`, `doubled` and `weights_backwards`, which
-should be none. Exit code 1 where there are any, where a service did not come back, or the learner
-was no further in the end. Takes root, iproute2 and iptables; writes nothing outside a temporary
-folder.
+Prints a line for each fault, and one line of JSON at the end: `works_again_s`, the time from the
+end of a fault until its service has done more work and was heard over the network;
+`all_work_again_s`, the same for the slowest of all services; `lost`, `doubled` and
+`weights_backwards`, which should be zero. Exit code 1 if any is not, if a service did not recover,
+or if the learner made no progress. Needs root, iproute2 and iptables; writes only to a temporary
+directory.
 """
 
 import argparse
@@ -40,16 +40,16 @@ from tests.chaos.chaos_observer import Observer, judge, watch
 from tests.chaos.chaos_stack import ON_DISKS, Service, stack
 
 PROMISED_S = 15.0
-LIMIT_S = 180.0  # so long is waited for a service that does not come back
+LIMIT_S = 180.0  # how long a service may take to recover
 UP_S = 300.0
 LEARNT = ("learner", "learner_steps")
-LEASE_S = 10.0  # of a Zenoh link: shorter and longer silences take different ways
+LEASE_S = 10.0  # of a Zenoh link, which survives shorter silences only
 CONFIG = {
     "arena.view_px": "32",
     "arena.max_frames": "30",
-    "replay.capacity": "3_000_000",  # so that nothing is replaced, and all can be looked for
+    "replay.capacity": "3_000_000",  # nothing is replaced, so that every transition can be checked
     "replay.snapshot_period_s": "2",
-    "replay.samples_per_insert": "2",  # so that a slow learner still lets all actors in in turn
+    "replay.samples_per_insert": "2",  # a slow learner still admits every actor
     "actor.spool_chunks": "4",
     "learner.precision": "float32",
     "learner.threads": "1",
@@ -57,17 +57,17 @@ CONFIG = {
     "evaluator.episodes": "2",
     "run.learner_steps": "0",
 }
-Recovered = dict[str, float]  # service to seconds; LIMIT_S: not within that
+Recovered = dict[str, float]  # seconds by service; LIMIT_S: did not recover in time
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens to which service, and for how long."""
+    """A kind of fault on a service, and its duration."""
 
     kind: str
     service: str
     seconds: float
-    degree: float  # 0 … 1, for those that have one
+    degree: float  # severity, 0 … 1, for the kinds that have one
 
     def __str__(self) -> str:
         return f"{self.kind} {self.service} {self.seconds:g} s"
@@ -95,7 +95,7 @@ KINDS = ("kill", "stop", "cut", "loss", "slow")
 
 
 def faults(rng: random.Random, services: list[str]) -> Iterator[Fault]:
-    """For ever; each kind on each service once, then again in another order."""
+    """Yield faults forever: each kind on each service once, then again in another order."""
     pairs = [(kind, service) for kind in KINDS for service in services]
     pairs += [("full", service) for service in ON_DISKS]
     pairs += [("clock", service) for service in ("learner", "actor-0")]
@@ -113,9 +113,9 @@ def main() -> int:
     parser.add_argument("--actors", type=int, default=4)
     parser.add_argument("--kinds", nargs="+", help="only these, such as kill stop cut")
     arguments = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that all is removed first
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that everything is cleaned up
     if (why := why_no_hosts()) is not None:
-        print(f"no hosts of our own: {why}", file=sys.stderr)
+        print(f"cannot create hosts: {why}", file=sys.stderr)
         return 1
 
     def chosen(services: list[str]) -> Iterator[Fault]:
@@ -137,9 +137,9 @@ def main() -> int:
 def ordeal(
     folder: Path, num_actors: int, chosen: Callable[[list[str]], Iterable[Fault]]
 ) -> dict[str, Any]:
-    """Faults, one after the other, and what came of it.
+    """Inflict faults one after the other and report what came of them.
 
-    chosen: those for services of these names, from the moment when all work.
+    chosen: gives the faults for services of these names; called once all services work.
     """
     config = load_config("smoke", CONFIG, environ={})
     with stack(config, folder, num_actors) as run, watch(run) as session:
@@ -166,14 +166,14 @@ def ordeal(
 
 
 def wait_until_up(observer: Observer) -> None:
-    """Raises AssertionError with what all said where they do not come up."""
+    """Wait until all services work; raise AssertionError with their logs if they do not."""
     recovered = observer.recovery(time.monotonic(), UP_S)
     if UP_S in recovered.values():
         raise AssertionError(f"never worked: {recovered}\n{observer.stack.logs()}")
 
 
 def suffer(observer: Observer, fault: Fault) -> Recovered:
-    """Seconds from the fault's end until each service worked again."""
+    """Inflict a fault; return the seconds from its end until each service worked again."""
     with fault.on(observer.stack.services[fault.service]):
         observer.listen(fault.seconds)
     recovered = observer.recovery(time.monotonic(), LIMIT_S)
@@ -191,7 +191,7 @@ def suffer(observer: Observer, fault: Fault) -> Recovered:
 
 
 def recoveries(suffered: list[tuple[Fault, Recovered]]) -> dict[str, Any]:
-    """How long they took, by kind of fault, and those that took longer than was promised."""
+    """Summarize recovery times by kind of fault, and list those longer than promised."""
     own: dict[str, list[float]] = {}
     for fault, recovered in suffered:
         own.setdefault(fault.kind, []).append(recovered[fault.service])

@@ -1,11 +1,11 @@
-"""How soon workers that join a run late have its newest weights.
+"""Time until workers that join a run late have its newest weights.
 
 `python -m benchmarks.late_joiners --joiners 50 --seconds 60` runs replay, an actor and a learner;
-then workers join at random moments within the time and stay: each opens a session of its own, asks
-for configuration and weights and builds its policy (`LivePolicy`), as evaluation workers and actors
-do. To spare a small machine fifty imports of PyTorch, each process holds several. What a joiner has
-is compared with the newest that this process had heard of when the joiner began. One line of JSON;
-exit code 1 where one had older weights.
+then workers join at random moments within the time and stay. Each opens its own session, requests
+configuration and weights and builds its policy (`LivePolicy`), as evaluators and actors do. Each
+process holds several joiners, to spare a small machine fifty imports of PyTorch. A joiner's weights
+are compared with the newest that this process had received when the joiner began. Prints one line
+of JSON; exit code 1 if a joiner had older weights.
 """
 
 import argparse
@@ -24,10 +24,10 @@ from typing import Any
 from benchmarks.learner_kills import Follower
 from benchmarks.machine import emit, spread
 from mrcdrl.common.config import TransportConfig
+from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.sync.live_policy import LivePolicy
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.train.fleet import ALLOCATOR
 from tests.system.system_processes import (
     REPOSITORY,
     Command,
@@ -44,8 +44,8 @@ _PATIENCE_S = 120.0
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--joiners", type=int, default=50)
-    parser.add_argument("--processes", type=int, default=5, help="that the joiners share")
-    parser.add_argument("--seconds", type=float, default=60.0, help="within which they join")
+    parser.add_argument("--processes", type=int, default=5, help="processes that hold the joiners")
+    parser.add_argument("--seconds", type=float, default=60.0, help="time within which they join")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--config", default="quick")
     parser.add_argument("--join", nargs=2, metavar=("RUN", "ENDPOINT"), help=argparse.SUPPRESS)
@@ -61,7 +61,7 @@ def main() -> int:
 
 
 def joined(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the joiners told, against what was published when."""
+    """Compare what the joiners report with what had been published by then."""
     name, endpoint = run_name("joiners"), free_endpoint()
     here = ["--run", name, "--run-dir", str(folder)]
     joining = [*here, "--connect", endpoint, "--id"]
@@ -90,8 +90,8 @@ def joined(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
                 running.callback(process.wait)
                 running.callback(process.kill)
                 processes.append(process)
-            told = [json.loads(_line(process)) for process in processes]
-            assert told == ["ready"] * len(processes)
+            replies = [json.loads(_line(process)) for process in processes]
+            assert replies == ["ready"] * len(processes)
             before = len(follower.published)
             for process in processes:
                 _begin(process)
@@ -137,11 +137,11 @@ def _begin(process: "subprocess.Popen[str]") -> None:
 
 
 def join(run: str, endpoint: str, count: int, seconds: float, seed: int) -> None:
-    """Join so many times, and stay until all have; a line for each when that is so."""
+    """Join this many times and stay until all have joined; then print a line for each."""
     rng = random.Random(seed)
     moments = [rng.uniform(0.0, seconds) for _ in range(count)]
-    told: list[dict[str, float]] = []
-    there = threading.Barrier(count)
+    joiners: list[dict[str, float]] = []
+    all_joined = threading.Barrier(count)
 
     def one(moment_s: float) -> None:
         time.sleep(moment_s)
@@ -149,7 +149,7 @@ def join(run: str, endpoint: str, count: int, seconds: float, seed: int) -> None
         with LivePolicy(run, endpoint) as policy:
             weights_s = time.monotonic() - began_s
             epoch = policy._policy.weights_epoch
-            told.append(
+            joiners.append(
                 {
                     "began_s": began_s,
                     "weights_s": weights_s,
@@ -157,7 +157,7 @@ def join(run: str, endpoint: str, count: int, seconds: float, seed: int) -> None
                     "version": policy.version,
                 }
             )
-            there.wait(seconds + _PATIENCE_S)
+            all_joined.wait(seconds + _PATIENCE_S)
 
     threads = [threading.Thread(target=one, args=(moment,)) for moment in moments]
     print(json.dumps("ready"), flush=True)
@@ -166,8 +166,8 @@ def join(run: str, endpoint: str, count: int, seconds: float, seed: int) -> None
         thread.start()
     for thread in threads:
         thread.join()
-    for line in told:
-        print(json.dumps(line), flush=True)
+    for joiner in joiners:
+        print(json.dumps(joiner), flush=True)
 
 
 if __name__ == "__main__":

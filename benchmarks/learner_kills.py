@@ -1,10 +1,10 @@
 """kill -9 of a run's learner at random moments: versions never go back, and learning goes on.
 
 `python -m benchmarks.learner_kills --kills 20` runs replay, an actor, an evaluator and robots that
-act by a `LivePolicy`, kills the learner again and again, each fifth time while it still starts, and
-starts it again. What is acted by is compared with what was published, to the last bit; afterwards
-the last weights before each kill and the first ones after it are judged on the same starts. Prints
-one line of JSON; exit code 1 where anything went back or was mixed.
+act by a `LivePolicy`, kills the learner again and again, every fifth time during its start-up, and
+restarts it. The parameters acted by are compared bit for bit with those published; afterwards the
+last weights before each kill and the first ones after it are evaluated on the same starts. Prints
+one line of JSON; exit code 1 if a version went back or parameters were mixed.
 """
 
 import argparse
@@ -32,12 +32,12 @@ from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights
 from mrcdrl.common.messages.wire import decode
 from mrcdrl.common.model.weights_io import weights_to_bytes
 from mrcdrl.common.runtime.files import RUN_CONFIG
+from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.sync.live_policy import LivePolicy
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.evaluator.evaluator import Judge
-from mrcdrl.services.train.fleet import ALLOCATOR
+from mrcdrl.services.evaluator.evaluator import WeightsTest
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
 SMALL_RUN = (
@@ -54,8 +54,8 @@ OFTEN = (
     "--evaluator.period_s=5",
     "--run.learner_steps=0",
 )
-DURING_START = 5  # each so many-th kill is followed by one while the learner starts
-_ROBOTS = 2  # that act by a LivePolicy, each with a session of its own
+DURING_START = 5  # every fifth kill is followed by one during the learner's start-up
+_ROBOTS = 2  # each acts by a LivePolicy with its own session
 
 Order = tuple[int, int]  # (epoch, version)
 
@@ -64,9 +64,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=300, help="of the learner between kills")
-    parser.add_argument("--longest", type=float, default=5.0, help="seconds more, at random")
-    parser.add_argument("--trained", type=Path, help="go on from a copy of this run's checkpoints")
+    parser.add_argument("--steps", type=int, default=300, help="learner steps between kills")
+    parser.add_argument(
+        "--longest", type=float, default=5.0, help="seconds added at random, at most"
+    )
+    parser.add_argument("--trained", type=Path, help="start from a copy of this run's checkpoints")
     arguments = parser.parse_args()
     small = ["--config", "quick", *SMALL_RUN]
     trained = ["--config", f"{arguments.trained}/{RUN_CONFIG}"]
@@ -94,10 +96,10 @@ def ordeal(
     longest_s: float,
     checkpoints: Path | None = None,
 ) -> dict[str, Any]:
-    """What came of so many kills.
+    """Kill the learner this many times and report what came of it.
 
-    configured: flags of replay, with the configuration. steps: that the learner makes at least
-    between two kills. longest_s: and so many seconds more, at random. checkpoints: to begin with.
+    configured: replay's flags, with the configuration. steps: minimum learner steps between two
+    kills, after which up to longest_s seconds pass. checkpoints: to start from.
     """
     rng = random.Random(seed)
     name, endpoint, began_s = run_name("kills"), free_endpoint(), time.monotonic()
@@ -134,7 +136,7 @@ def ordeal(
                     eventually(lambda: follower.reaches(due), f"learner step {due}")  # noqa: B023
                     if number == kills:
                         newest = follower.taken[-1].version
-                        eventually(lambda: follower.has_judged(newest), f"{newest} is judged")  # noqa: B023
+                        eventually(lambda: follower.has_evaluated(newest), f"{newest} is evaluated")  # noqa: B023
                         learner.signal(signal.SIGTERM)
                         code = learner.wait()
                         last_words = learner.err
@@ -145,14 +147,14 @@ def ordeal(
                     with process("learner") as starting:
                         follower.listen_for(rng.uniform(0.5, 4.0))
                         kill(starting)
-                follower.listen_for(1.0)  # what was under way
+                follower.listen_for(1.0)  # messages in flight
             follower.listen_for(1.0)
             config = robots[0].config
             seconds = time.monotonic() - began_s
     finally:
         end_all(name)
     torch.set_num_threads(config.evaluator.threads)
-    judge = Judge(config, "judge")
+    test = WeightsTest(config, "evaluator")
     return {
         "kills": kills + kills // DURING_START,
         "seed": seed,
@@ -166,9 +168,9 @@ def ordeal(
         "mixed": [line for robot in robots for line in mixed(robot.acted, follower.digests())],
         "acted_by": [len(robot.acted) for robot in robots],
         "evaluations": [
-            (e.learner_step, e.weights_version, e.success_rate) for e in follower.judged
+            (e.learner_step, e.weights_version, e.success_rate) for e in follower.evaluated
         ],
-        **scores([(judge.judge(a, _on), judge.judge(b, _on)) for a, b in resumed]),
+        **scores([(test.evaluate(a, _on), test.evaluate(b, _on)) for a, b in resumed]),
     }
 
 
@@ -179,16 +181,16 @@ def _on() -> bool:
 def kill(learner: Command) -> None:
     learner.signal(signal.SIGKILL)
     if learner.wait() != -signal.SIGKILL:
-        raise AssertionError(f"the learner ended by itself: {learner.err}")
+        raise AssertionError(f"the learner ended before it was killed: {learner.err}")
 
 
-def scores(judged: Sequence[tuple[Evaluation | None, Evaluation | None]]) -> dict[str, Any]:
-    """Successes before a kill and after it, and what they differ by in standard deviations.
+def scores(evaluated: Sequence[tuple[Evaluation | None, Evaluation | None]]) -> dict[str, Any]:
+    """Compare success rates before and after each kill.
 
-    Each pair was judged on the same starts; `beyond_noise` counts those that differ by more than
-    two proportions of that many episodes do in 95 of 100 cases.
+    Each pair was evaluated on the same starts; `beyond_noise` counts the pairs whose difference is
+    significant at 5 % (two proportions).
     """
-    pairs = [(a, b) for a, b in judged if a is not None and b is not None]
+    pairs = [(a, b) for a, b in evaluated if a is not None and b is not None]
     deviations = []
     for before, after in pairs:
         rate = (before.success_rate + after.success_rate) / 2
@@ -206,7 +208,7 @@ def scores(judged: Sequence[tuple[Evaluation | None, Evaluation | None]]) -> dic
 
 
 class Follower:
-    """Hears all that is published of weights, evaluations and statistics, and follows itself."""
+    """Records all published weights, evaluations and statistics, and follows the weights itself."""
 
     def __init__(self, session: Session, keys: Keys) -> None:
         self._reader = WeightsReader(session, keys)
@@ -215,7 +217,7 @@ class Follower:
         self._stats = session.queue_subscriber(keys.every_stats)
         self.taken: list[Weights] = []
         self.published: list[Weights] = []
-        self.judged: list[Evaluation] = []
+        self.evaluated: list[Evaluation] = []
         self.told: dict[str, list[int]] = {"actor": [], "evaluator": [], "learner": []}
 
     @property
@@ -227,11 +229,11 @@ class Follower:
         return self.published[-1].learner_step if self.published else 0
 
     def listen(self) -> None:
-        """For half a second at most, or until the reader has newer weights."""
+        """Listen until the reader has newer weights, half a second at most."""
         newer = self._reader.latest(0.5)
         self.taken += [newer] if newer else []
         self.published += [decode(Weights, payload) for _, payload in self._published.drain()]
-        self.judged += [decode(Evaluation, payload) for _, payload in self._evaluations.drain()]
+        self.evaluated += [decode(Evaluation, payload) for _, payload in self._evaluations.drain()]
         for _, payload in self._stats.drain():
             stats = decode(Stats, payload)
             if stats.role in self.told:
@@ -247,26 +249,26 @@ class Follower:
         return self.newest is not before and bool(self.taken)
 
     def first_after(self, before: Weights) -> Weights:
-        """The weights published right after these."""
+        """The weights published right after `before`."""
         return self.published[self.published.index(before) + 1]
 
     def reaches(self, learner_step: int) -> bool:
         self.listen()
         return bool(self.taken) and self.taken[-1].learner_step >= learner_step
 
-    def has_judged(self, version: int) -> bool:
+    def has_evaluated(self, version: int) -> bool:
         self.listen()
-        return bool(self.judged) and self.judged[-1].weights_version >= version
+        return bool(self.evaluated) and self.evaluated[-1].weights_version >= version
 
     def digests(self) -> dict[Order, str]:
         return {weights.order: weights.digest for weights in self.published}
 
     def went_back(self) -> list[str]:
-        """A line for each that came after a newer one: on the wire, taken, judged, acted by."""
-        judged = [(e.weights_epoch, e.weights_version) for e in self.judged]
+        """A line for each version that followed a newer one: on the wire, taken or evaluated."""
+        evaluated = [(e.weights_epoch, e.weights_version) for e in self.evaluated]
         lines = backwards("published", [weights.order for weights in self.published])
         lines += backwards("taken", [weights.order for weights in self.taken])
-        lines += backwards("judged", judged, again=True)
+        lines += backwards("evaluated", evaluated, again=True)
         for role, versions in self.told.items():
             lines += backwards(role, [(0, version) for version in versions], again=True)
         if self._reader.refused:
@@ -275,7 +277,7 @@ class Follower:
 
 
 def backwards(what: str, orders: Sequence[Order], *, again: bool = False) -> list[str]:
-    """A line for each that is not above the one before it; again: the same may come."""
+    """A line for each that is not above its predecessor; again: equal ones are allowed."""
     return [
         f"{what}: {after} after {before}"
         for before, after in pairwise(orders)
@@ -284,16 +286,16 @@ def backwards(what: str, orders: Sequence[Order], *, again: bool = False) -> lis
 
 
 def mixed(acted: Sequence[tuple[Order, str]], digests: dict[Order, str]) -> list[str]:
-    """A line for each version whose parameters, as acted by, are not those published."""
+    """A line for each version that was acted by with other parameters than those published."""
     return [
-        f"acted by {order}, and not as it was published"
+        f"acted by {order}, with other parameters than published"
         for order, digest in acted
         if digests.get(order, digest) != digest
     ]
 
 
 class Robot:
-    """Acts by a LivePolicy in a thread of its own, and notes by which parameters."""
+    """Acts by a LivePolicy in its own thread, and records by which parameters."""
 
     def __init__(self, run: str, endpoint: str) -> None:
         self._policy = LivePolicy(run, endpoint, timeout_s=120)

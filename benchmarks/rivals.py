@@ -1,7 +1,7 @@
-"""The paper's test for the controllers, all of which see the true state.
+"""The paper's test of the controllers, all of which see the true state.
 
 Prints one line of JSON for each controller, number of robots and epsilon: rates, their interval and
-the measures of navigation. The paper's 1 100 starts take minutes for each line.
+the measures of navigation. With the paper's 1 100 starts a line takes minutes.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from benchmarks.machine import emit
 from mrcdrl.common.arena.controllers import CONTROLLERS, check_controller
 from mrcdrl.common.config import load_config
 from mrcdrl.common.messages.trajectory import Weights
-from mrcdrl.services.tools.evaluate import judge
+from mrcdrl.services.tools.evaluate import evaluate
 from mrcdrl.services.tools.subject import Subject
 
 
@@ -33,8 +33,8 @@ def main() -> None:
             "evaluator.epsilon": str(epsilon),
         }
         config = load_config("quick", overrides, environ={})
-        judged = Subject(config, None, check_controller(name), Weights.of(0, 0, 0, b""))
-        result, measures = judge(judged, arguments.episodes, arguments.seed, lambda _done: None)
+        subject = Subject(config, None, check_controller(name), Weights.of(0, 0, 0, b""))
+        result, measures = evaluate(subject, arguments.episodes, arguments.seed, lambda _done: None)
         emit(
             {
                 "bench": "rivals",

@@ -1,9 +1,9 @@
-"""Updates a second of stable-baselines3's DQN on our arena, as `benchmarks.system` compares them.
+"""Updates per second of stable-baselines3's DQN on our arena, for `benchmarks.system` to compare.
 
-One process; 64 robot steps of 8 arenas with two robots, then as many updates as the samples a step
-want: 16 of batch 32 where each of the transitions is to be sampled 8 times, which is a batch of 32
-every 4 steps. It explores as at a run's end, so that it acts by its network nearly always. Prints
-one line of JSON.
+One process alternates between 64 robot steps (8 arenas of two robots) and the updates that the
+samples per step call for: 16 of batch 32 at 8 samples per transition, or a batch of 32 every 4
+steps. It explores as at the end of a run, so that it nearly always acts by its network. Prints one
+line of JSON.
 """
 
 import argparse
@@ -24,7 +24,7 @@ ARENAS, ROBOTS, TRAIN_FREQUENCY, BATCH = 8, 2, 4, 32
 
 
 class PaperFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
-    """The convolutions of our network, on pictures that stable-baselines3 made 0 … 1."""
+    """Our network's convolutions, on images that stable-baselines3 has scaled to 0 … 1."""
 
     def __init__(self, observation_space: object) -> None:
         super().__init__(observation_space, feature_size(60))
@@ -45,7 +45,7 @@ NETWORKS: dict[str, dict[str, object]] = {
 
 
 class Rates(BaseCallback):  # type: ignore[misc]
-    """Ends training after so many seconds of learning, a warm-up before them."""
+    """Measures for this many seconds of learning after a warm-up, then ends training."""
 
     def __init__(self, warm_up_s: float, seconds: float) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--network", choices=NETWORKS, default="paper")
     parser.add_argument("--samples-per-step", type=int, default=8)
-    parser.add_argument("--threads", type=int, default=0, help="0: as PyTorch chooses")
+    parser.add_argument("--threads", type=int, default=0, help="0: PyTorch's default")
     parser.add_argument("--warm-up", type=float, default=5.0)
     parser.add_argument("--seconds", type=float, default=20.0)
     arguments = parser.parse_args()

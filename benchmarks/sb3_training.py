@@ -2,12 +2,11 @@
 
     python -m benchmarks.sb3_training --minutes 90 --threads 1 >> RESULTS.jsonl
 
-All that it can be told of what our preset quick does, it is told: the paper's convolutions, 3-step
-returns, Huber loss, the scale of rewards, the learning rate and its schedule, Adam's epsilon, the
-target's period, exploration by updates, and a batch of 32 every 4 robot steps. It has no double
-targets, duel network or symmetries. One line of JSON with the successes of the last 100 training
-episodes every 1000 updates, and one for each test, of which the first comes when half of those
-episodes succeeded.
+It is set up like our preset quick where it can be: the paper's convolutions, 3-step returns, Huber
+loss, reward scale, learning rate and its schedule, Adam's epsilon, target period, exploration by
+updates, and a batch of 32 every 4 robot steps. It has no double targets, duel network or
+symmetries. Prints one line of JSON with the successes of the last 100 training episodes every 1000
+updates, and one for each test; the first test comes when half of those episodes succeeded.
 """
 
 import argparse
@@ -30,16 +29,16 @@ from mrcdrl.common.config import ArenaConfig, Config, load_config
 from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, Outcome, UInt8Array
 from mrcdrl.common.model.policy import Selection
-from mrcdrl.services.evaluator.trial import PER, PolicyPlayer, play
+from mrcdrl.services.evaluator.trial import EPISODES_PER_BLOCK, PolicyPlayer, play
 
-_TELL_UPDATES = 1_000
+_REPORT_UPDATES = 1_000
 _TEST_UPDATES = 2_500
-_TESTED_FROM = 50  # successes of the last 100 training episodes
+_TESTED_FROM = 50  # successes in the last 100 training episodes
 _BUFFER = 200_000
 
 
 class ScaledRewards(VecEnvWrapper):  # type: ignore[misc]
-    """Rewards as our learner sees them."""
+    """Scales rewards as our learner does."""
 
     def __init__(self, arenas: ArenaVecEnv, scale: float) -> None:
         super().__init__(arenas)
@@ -54,7 +53,7 @@ class ScaledRewards(VecEnvWrapper):  # type: ignore[misc]
 
 
 class Greedy:
-    """The model's values, acted by as our evaluator acts by ours."""
+    """Acts by the model's values as our evaluator acts by ours."""
 
     def __init__(self, model: DQN) -> None:
         self._model = model
@@ -70,16 +69,16 @@ class Greedy:
         return Selection(actions=actions, q_values=values, greedy_q=values.max(axis=1))
 
 
-class Judge(BaseCallback):  # type: ignore[misc]
-    """Tells how training goes, tests, and ends it at the wanted successes or when time is over."""
+class Evaluation(BaseCallback):  # type: ignore[misc]
+    """Reports and tests during training; ends it at the wanted successes or out of time."""
 
     def __init__(self, arena: ArenaConfig, wanted: int, seconds: float) -> None:
         super().__init__()
         self._arena, self._wanted, self._seconds = arena, wanted, seconds
-        self._outcomes: deque[str] = deque(maxlen=PER)
+        self._outcomes: deque[str] = deque(maxlen=EPISODES_PER_BLOCK)
         self._began_s = time.perf_counter()
         self._testing_s = 0.0
-        self._told = self._tested = 0
+        self._reported = self._tested = 0
 
     def _on_step(self) -> bool:
         ended = np.flatnonzero(self.locals["dones"])[::ROBOTS]  # one robot of each arena
@@ -88,9 +87,9 @@ class Judge(BaseCallback):  # type: ignore[misc]
 
     def _on_rollout_end(self) -> None:
         updates = self.model._n_updates
-        if updates - self._told >= _TELL_UPDATES:
-            self._told = updates
-            self._tell()
+        if updates - self._reported >= _REPORT_UPDATES:
+            self._reported = updates
+            self._report()
 
     def on_rollout_start(self) -> None:
         super().on_rollout_start()
@@ -110,7 +109,7 @@ class Judge(BaseCallback):  # type: ignore[misc]
     def _learning_s(self) -> float:
         return time.perf_counter() - self._began_s - self._testing_s
 
-    def _tell(self, **more: object) -> None:
+    def _report(self, **more: object) -> None:
         emit(
             {
                 "bench": "sb3_training",
@@ -125,17 +124,18 @@ class Judge(BaseCallback):  # type: ignore[misc]
         )
 
     def _test(self) -> int:
-        """Successes of the paper's test, which does not count as time of training."""
+        """Successes in the paper's test; its time does not count as training time."""
         began_s = time.perf_counter()
         config = Config(arena=self._arena)
         player = PolicyPlayer(
             self._arena, make_codec(self._arena), Greedy(self.model),  # type: ignore[arg-type]
             config.evaluator.epsilon, np.random.default_rng(0),
         )  # fmt: skip
-        results = play(self._arena, test_starts(self._arena, PER, 0), player) or []
+        starts = test_starts(self._arena, EPISODES_PER_BLOCK, 0)
+        results = play(self._arena, starts, player) or []
         successes = [r.outcome for r in results].count(Outcome.SUCCESS)
         self._testing_s += time.perf_counter() - began_s
-        self._tell(test_successes_of_100=successes)
+        self._report(test_successes_of_100=successes)
         return successes
 
 
@@ -144,7 +144,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=90)
     parser.add_argument("--wanted", type=int, default=90, help="successes of 100")
     parser.add_argument("--samples-per-step", type=int, default=8)
-    parser.add_argument("--threads", type=int, default=0, help="0: as PyTorch chooses")
+    parser.add_argument("--threads", type=int, default=0, help="0: PyTorch's default")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.threads:
@@ -168,9 +168,9 @@ def main() -> None:
         agent.learning_rate * value_at(agent.learning_rate_schedule, model._n_updates)
     )
     model.exploration_schedule = lambda _: value_at(quick.exploration.schedule, model._n_updates)
-    judge = Judge(quick.arena, arguments.wanted, arguments.minutes * 60)
+    evaluation = Evaluation(quick.arena, arguments.wanted, arguments.minutes * 60)
     with contextlib.suppress(StopIteration):
-        model.learn(1_000_000_000, callback=judge)
+        model.learn(1_000_000_000, callback=evaluation)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What the learner keeps of its speed while the whole system runs, and stable-baselines3 beside it.
+"""The learner's speed while the whole system runs, compared with stable-baselines3.
 
     python -m benchmarks.system --cores 0,1 --rounds 2 --sb3
 
 Each round starts replay, learner, actors and evaluator as `mrcdrl train` does, fills the table and
-takes turns: the learner with actors and evaluator, with actors at the rate limiter's ratio, and
-alone, on what was collected meanwhile (`replay.tolerance` lets it be so far behind). Only the
-others are stopped and started; the learner goes on. Then, with nothing else, stable-baselines3's
-DQN with as many samples a step. One line of JSON for each round, then medians on stderr.
+alternates phases: the learner with actors and evaluator, with actors at the rate limiter's ratio,
+and alone, on the transitions collected meanwhile (`replay.tolerance` lets it fall that far behind).
+The others are stopped and restarted; the learner keeps running. Then stable-baselines3's DQN runs
+alone with as many samples per step. Prints one line of JSON per round, then medians on stderr.
 """
 
 import argparse
@@ -25,14 +25,14 @@ from benchmarks.replay_peers import run
 from mrcdrl.common.config import Config, TransportConfig
 from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.train.fleet import ALLOCATOR
-from mrcdrl.services.train.main import num_actors
+from mrcdrl.services.train.launcher import num_actors
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
-TURNS = ("actors and evaluator", "actors", "alone")
-_TUNED = "one thread, allocator tuned"  # as our learner is, on two cores
+PHASES = ("actors and evaluator", "actors", "alone")
+_TUNED = "one thread, allocator tuned"  # like our learner on two cores
 SB3: dict[str, tuple[Sequence[str], dict[str, str]]] = {
     "sb3, the paper's network": (("--network=paper",), {}),
     f"sb3, the paper's network, {_TUNED}": (("--network=paper", "--threads=1"), ALLOCATOR),
@@ -47,22 +47,24 @@ def main() -> None:
     parser.add_argument("--config", default="quick")
     parser.add_argument("--cores", default=",".join(map(str, sorted(os.sched_getaffinity(0)))))
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--turns", type=int, default=2, help="in a round, of each kind")
-    parser.add_argument("--seconds", type=float, default=15.0, help="of a turn")
+    parser.add_argument("--turns", type=int, default=2, help="phases of each kind in a round")
+    parser.add_argument("--seconds", type=float, default=15.0, help="length of a phase")
     parser.add_argument("--samples-per-step", type=int, default=8)
     parser.add_argument("--threads", type=int, default=0, help="learner.threads")
     parser.add_argument("--actors", type=int, default=0)
     parser.add_argument("--tolerance", type=float, default=3.0, help="replay.tolerance")
     parser.add_argument("--sb3", action="store_true")
-    parser.add_argument("--setting", nargs="*", default=[], help="others, as --agent.kind=dqn")
+    parser.add_argument(
+        "--setting", nargs="*", default=[], help="more settings, such as --agent.kind=dqn"
+    )
     arguments = parser.parse_args()
     os.sched_setaffinity(0, map(int, arguments.cores.split(",")))
     found: dict[str, list[float]] = {}
-    for turn in range(arguments.rounds):
+    for number in range(arguments.rounds):
         rates = system(arguments)
         if arguments.sb3:
             rates |= {name: [rival(arguments, name)] for name in SB3}
-        emit({"bench": "system", "round": turn, "updates_per_s": rates, **vars(arguments)})
+        emit({"bench": "system", "round": number, "updates_per_s": rates, **vars(arguments)})
         for name, figures in rates.items():
             found.setdefault(name, []).extend(figures)
     for name, figures in found.items():
@@ -71,7 +73,7 @@ def main() -> None:
 
 
 def rival(arguments: argparse.Namespace, name: str) -> float:
-    """Updates a second of stable-baselines3."""
+    """Updates per second of stable-baselines3."""
     flags, environment = SB3[name]
     timing = ["--seconds", str(arguments.seconds)]
     ratio = ["--samples-per-step", str(arguments.samples_per_step)]
@@ -81,17 +83,17 @@ def rival(arguments: argparse.Namespace, name: str) -> float:
 
 
 def system(arguments: argparse.Namespace) -> dict[str, list[float]]:
-    """Updates a second in each turn of one run."""
+    """Updates per second in each phase of one run."""
     with tempfile.TemporaryDirectory() as folder:
         name = run_name("system")
         try:
-            return Run(arguments, Path(folder), name).turns()
+            return Run(arguments, Path(folder), name).phases()
         finally:
             end_all(name)
 
 
 class Run:
-    """Processes of one run, and what their statistics say."""
+    """The processes of one run, measured by their statistics."""
 
     def __init__(self, arguments: argparse.Namespace, folder: Path, name: str) -> None:
         self._arguments = arguments
@@ -99,7 +101,7 @@ class Run:
         self._name = name
         self._endpoint = free_endpoint()
 
-    def turns(self) -> dict[str, list[float]]:
+    def phases(self) -> dict[str, list[float]]:
         arguments = self._arguments
         actors = [f"actor-{i}" for i in range(arguments.actors or num_actors(Config()))]
         serving = ["--config", arguments.config, "--listen", self._endpoint]
@@ -109,7 +111,7 @@ class Run:
             f"--learner.threads={arguments.threads}",
             *("--evaluator.period_s=0", *arguments.setting),
         ]
-        found: dict[str, list[float]] = {turn: [] for turn in TURNS}
+        found: dict[str, list[float]] = {phase: [] for phase in PHASES}
         with (
             self._command("replay", serving),
             Session(TransportConfig(connect=(self._endpoint,)), open_timeout_s=60) as session,
@@ -121,12 +123,12 @@ class Run:
                     with self._joined(["evaluator-0"]):
                         stats.wait("evaluator", "busy", 1)
                         stats.wait("replay", "insert_held", 1)
-                        found[TURNS[0]].append(stats.rate(arguments.seconds))
+                        found[PHASES[0]].append(stats.rate(arguments.seconds))
                     stats.wait("replay", "insert_held", 1)
-                    found[TURNS[1]].append(stats.rate(arguments.seconds))
-                found[TURNS[2]].append(stats.rate(arguments.seconds))
+                    found[PHASES[1]].append(stats.rate(arguments.seconds))
+                found[PHASES[2]].append(stats.rate(arguments.seconds))
                 stats.wait("replay", "sample_held", 0)
-        return {turn: [round(rate, 1) for rate in rates] for turn, rates in found.items()}
+        return {phase: [round(rate, 1) for rate in rates] for phase, rates in found.items()}
 
     def _command(self, role: str, arguments: Sequence[str]) -> Command:
         where = ("--run", self._name, "--run-dir", str(self._folder))
@@ -142,14 +144,14 @@ class Run:
 
 
 class _Statistics:
-    """The newest of each role."""
+    """The newest statistics of each role."""
 
     def __init__(self, session: Session, keys: Keys) -> None:
         self._stats = session.queue_subscriber(keys.every_stats)
         self._newest: dict[str, dict[str, float]] = {}
 
     def wait(self, role: str, metric: str, value: float) -> None:
-        """Until the newest metric is that; none counts that came before."""
+        """Wait until the metric has this value in statistics that arrive from now on."""
         self._listen()
         self._newest.clear()
         eventually(
@@ -158,7 +160,7 @@ class _Statistics:
         )
 
     def rate(self, seconds: float) -> float:
-        """Updates a second of the learner, from one of its statistics to another."""
+        """The learner's updates per second, between two of its statistics messages."""
         time.sleep(_SETTLE_S)
         self._listen()
         began_s, began = self._step()
@@ -170,7 +172,9 @@ class _Statistics:
     def _step(self) -> tuple[float, float]:
         self._newest.pop("learner", None)
         eventually(
-            lambda: self._listen() and "learner" in self._newest, "the learner tells", pause_s=0
+            lambda: self._listen() and "learner" in self._newest,
+            "the learner publishes statistics",
+            pause_s=0,
         )
         return time.perf_counter(), self._newest["learner"]["learner_steps"]
 

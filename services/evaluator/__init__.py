@@ -1,1 +1,1 @@
-"""The evaluator: judges live weights by the paper's test."""
+"""The evaluator: evaluates live weights by the paper's test."""

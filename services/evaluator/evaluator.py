@@ -1,4 +1,4 @@
-"""`mrcdrl evaluator`: join a run, judge its live weights again and again, keep the best."""
+"""`mrcdrl evaluator`: evaluate a run's live weights again and again, and keep the best."""
 
 import dataclasses
 import logging
@@ -11,6 +11,7 @@ import numpy as np
 from mrcdrl.common.arena import Start, make_codec, test_starts
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import CheckpointError
+from mrcdrl.common.messages.metrics import EvaluatorMetrics
 from mrcdrl.common.messages.trajectory import Evaluation, Weights
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.model.policy import make_policy
@@ -29,7 +30,7 @@ _POLL_S = 0.2
 
 
 class Evaluator:
-    """The shell around a judge."""
+    """The service: follows the weights, evaluates them, publishes the results."""
 
     def __init__(
         self, config: Config, joining: Joining, session: Session, stop: StopSignal
@@ -38,8 +39,8 @@ class Evaluator:
         self._settings = config.evaluator
         self._stop = stop
         self._reader = WeightsReader(session, keys)
-        self._judge = Judge(config, worker)
-        self._best = Best(joining.run_dir / BEST_WEIGHTS)
+        self._test = WeightsTest(config, worker)
+        self._best = BestWeights(joining.run_dir / BEST_WEIGHTS)
         self._publisher = session.publisher(keys.evaluation(worker))
         self._reporter = StatsReporter(
             session.publisher(keys.stats("evaluator", worker)), "evaluator", worker
@@ -49,7 +50,7 @@ class Evaluator:
         self._busy = False
 
     def run(self) -> None:
-        """Judge, rest, take the newest weights, until stopped."""
+        """Evaluate, rest, take the newest weights, until stopped."""
         weights = self._reader.wait(self._stop, meanwhile=self._report)
         while weights is not None:
             began_s = time.monotonic()
@@ -59,10 +60,10 @@ class Evaluator:
             weights = self._newest_after(began_s + rest_s)
 
     def _evaluate(self, weights: Weights) -> None:
-        """Judge one version, publish the result, keep the weights if they are the best."""
+        """Evaluate one version, publish the result, keep the weights if they are the best."""
         self._version, self._busy = weights.version, True
         try:
-            result = self._judge.judge(weights, self._go_on)
+            result = self._test.evaluate(weights, self._keep_going)
         except CheckpointError as error:
             _LOG.warning("weights %d refused: %s", weights.version, error)
             result = None
@@ -73,15 +74,15 @@ class Evaluator:
             self._best.offer(weights, result)
 
     def _newest_after(self, until_s: float) -> Weights | None:
-        """The newest weights once the time has come and there are newer ones; None at the end."""
+        """Wait until this time and for newer weights; return them, or None once stopped."""
         newest: Weights | None = None
         while newest is None or time.monotonic() < until_s:
-            if not self._go_on():
+            if not self._keep_going():
                 return None
             newest = self._reader.latest(_POLL_S) or newest
         return newest
 
-    def _go_on(self) -> bool:
+    def _keep_going(self) -> bool:
         self._report()
         return not self._stop.is_set()
 
@@ -89,16 +90,14 @@ class Evaluator:
         self._reporter.worked()
         self._reporter.maybe(self._metrics)
 
-    def _metrics(self) -> dict[str, float]:
-        return {
-            "evaluations": self._evaluations,
-            "weights_version": self._version,
-            "busy": self._busy,
-        }
+    def _metrics(self) -> EvaluatorMetrics:
+        return EvaluatorMetrics(
+            evaluations=self._evaluations, weights_version=self._version, busy=self._busy
+        )
 
 
-class Judge:
-    """Runs the test on weights; the same starts each time."""
+class WeightsTest:
+    """Evaluates weights by the paper's test, from the same starts each time."""
 
     def __init__(self, config: Config, worker: str) -> None:
         self._config = config
@@ -108,8 +107,11 @@ class Judge:
             config.arena, config.evaluator.episodes, config.evaluator.seed
         )
 
-    def judge(self, weights: Weights, go_on: Callable[[], bool]) -> Evaluation | None:
-        """The evaluation; None where `go_on` said no."""
+    def evaluate(self, weights: Weights, keep_going: Callable[[], bool]) -> Evaluation | None:
+        """Evaluate the weights; None as soon as `keep_going` returns False.
+
+        Raises CheckpointError for weights of another network.
+        """
         config, began_s = self._config, time.monotonic()
         self._policy.adopt(weights)
         player = PolicyPlayer(
@@ -119,7 +121,7 @@ class Judge:
             config.evaluator.epsilon,
             np.random.default_rng(config.evaluator.seed),
         )
-        results = play(config.arena, self._starts, player, go_on=lambda _done: go_on())
+        results = play(config.arena, self._starts, player, keep_going=lambda _done: keep_going())
         if results is None:
             return None
         return evaluation(
@@ -132,19 +134,19 @@ class Judge:
         )
 
 
-class Best:
-    """The weights judged best so far, kept beside the checkpoints."""
+class BestWeights:
+    """The file of the weights that scored best so far, beside the checkpoints."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def offer(self, weights: Weights, result: Evaluation) -> None:
-        """Keep the weights if they did better: more successes, or as many in less time."""
+        """Keep the weights if they scored better: more successes, or as many in fewer frames."""
         if (result.success_rate, -result.mean_frames) > self._rank():
             write_weights(self._path, weights.payload, dataclasses.asdict(result))
 
     def _rank(self) -> tuple[float, float]:
-        """Of the file, which another evaluator may have written since."""
+        """Rank the kept weights, read again because another evaluator may have replaced them."""
         try:
             _, manifest = read_weights(self._path)
         except CheckpointError:

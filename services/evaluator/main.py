@@ -10,11 +10,11 @@ from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.evaluator import Evaluator
 
-_NICE = 10  # judging gives way to learning where they share cores
+_NICE = 10  # evaluating yields to learning on shared cores
 
 
 def main(argv: Sequence[str]) -> int:
-    """Judge for a run; the exit code."""
+    """Evaluate for a run; return the exit code."""
     joining = Joining.from_argv("evaluator", argv)
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session:
@@ -22,6 +22,6 @@ def main(argv: Sequence[str]) -> int:
         torch.set_num_threads(config.evaluator.threads)
         evaluator = Evaluator(config, joining, session, stop)
         session.announce(joining.keys.live("evaluator", joining.worker))
-        os.nice(_NICE)  # not sooner: whoever starts it again waits for it
+        os.nice(_NICE)  # only now: a restart waits for the start-up
         evaluator.run()
     return 0

@@ -1,7 +1,7 @@
-"""Measures of navigation beside the paper's: collisions with whom, time, way, separation.
+"""Navigation measures beyond the paper's: kind of collision, time, path length, separation.
 
-Invariants: pure; computed from the path of each episode once it has ended. Rates of success, of
-collision with a robot, of collision with a wall, and of time-out sum to 1.
+Invariants: pure; computed from each episode's path after its end. The rates of success, collision
+with a robot, collision with a wall, and time-out sum to 1.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, Outcome
 
 @dataclass(frozen=True, slots=True)
 class Journey:
-    """What one episode's robots did on their way."""
+    """What each robot did during one episode."""
 
-    path_px: Float64Array  # [K], way driven
-    straight_px: Float64Array  # [K], from the start to its own target at the end
+    path_px: Float64Array  # [K], length of the path driven
+    straight_px: Float64Array  # [K], from the start to its target at the end
     separation_px: Float64Array  # [K], smallest gap to another robot's rim; inf without another
-    hit_robot: BoolArray  # [K], who was stopped by a robot and no wall
-    hit_wall: BoolArray  # [K], who was stopped by a wall
+    hit_robot: BoolArray  # [K], stopped by a robot and not by a wall
+    hit_wall: BoolArray  # [K], stopped by a wall
 
 
 @dataclass(frozen=True, slots=True)
 class RobotNavigation:
-    """Measures of one robot, over all episodes; None where there is nothing to measure."""
+    """Measures of one robot over all episodes; None where there is nothing to measure."""
 
     collision_with_robot_rate: float  # of the episodes
     collision_with_wall_rate: float  # of the episodes
@@ -39,8 +39,8 @@ class RobotNavigation:
 class Navigation:
     """Measures of all episodes; None where there is nothing to measure.
 
-    The straight line runs from the start to the centre of the target that is the robot's own at the
-    end; ways and lines are summed before they are divided, because a robot may start on its target.
+    The straight line runs from the start to the centre of the robot's target at the end. Path and
+    line lengths are summed before they are divided, because a robot may start on its target.
     """
 
     success_rate: float
@@ -50,7 +50,7 @@ class Navigation:
     frames_to_success_mean: float | None
     frames_to_success_p50: float | None
     frames_to_success_p90: float | None
-    path_over_straight_mean: float | None  # all robots' way over all their lines, by episode
+    path_over_straight_mean: float | None  # paths over straight lines, summed over robots
     path_over_straight_p90: float | None
     smallest_separation_px: float | None  # gap between two rims
     smallest_separation_p50_px: float | None  # of the episodes' smallest
@@ -64,7 +64,10 @@ def journey(
     hit_wall: BoolArray,
     radius_px: float,
 ) -> Journey:
-    """Of a path [T, K, 3] to targets [M, 2]."""
+    """Measure a path [T, K, 3] of x px, y px, heading, to targets [M, 2].
+
+    hit_robot, hit_wall: what stopped each robot in the last frame, [K].
+    """
     places = path[..., :2]
     own = targets[shortest_assignment(Scene(path[-1], targets))]
     apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
@@ -81,7 +84,7 @@ def journey(
 def navigation(
     outcomes: Sequence[Outcome], frames: Sequence[int], journeys: Sequence[Journey]
 ) -> Navigation:
-    """The measures of episodes: how each ended, after how many frames, and its journey."""
+    """Aggregate episodes, given each one's outcome, number of frames and journey."""
     won = np.array([outcome is Outcome.SUCCESS for outcome in outcomes])
     failed = np.array([outcome is Outcome.COLLISION for outcome in outcomes])
     hit_robot = np.stack([j.hit_robot for j in journeys])
@@ -119,7 +122,7 @@ def navigation(
 
 
 def navigation_table(measures: Navigation) -> str:
-    """The measures for a reader."""
+    """Format the measures for a terminal."""
     robots = measures.robots
     head = "".join(f"{f'robot {k}':>10}" for k in range(len(robots)))
     return f"""\
@@ -127,14 +130,14 @@ def navigation_table(measures: Navigation) -> str:
 with a wall alone {measures.collision_with_wall_rate:.2%}
   frames to success: mean {_shown(measures.frames_to_success_mean)}, \
 p50 {_shown(measures.frames_to_success_p50)}, p90 {_shown(measures.frames_to_success_p90)}
-  way over straight line: mean {_shown(measures.path_over_straight_mean, 2)}, \
+  path length ÷ straight line: mean {_shown(measures.path_over_straight_mean, 2)}, \
 p90 {_shown(measures.path_over_straight_p90, 2)}
   smallest gap between robots: {_shown(measures.smallest_separation_px, 1)} px, \
 median of the episodes' {_shown(measures.smallest_separation_p50_px, 1)} px
   by robot               {head}
     collision with robot {"".join(f"{r.collision_with_robot_rate:10.2%}" for r in robots)}
     collision with wall  {"".join(f"{r.collision_with_wall_rate:10.2%}" for r in robots)}
-    way over straight    {"".join(f"{_shown(r.path_over_straight, 2):>10}" for r in robots)}
+    path ÷ straight line {"".join(f"{_shown(r.path_over_straight, 2):>10}" for r in robots)}
     smallest gap, px     {"".join(f"{_shown(r.smallest_separation_px, 1):>10}" for r in robots)}
 """
 
@@ -144,7 +147,7 @@ def _mean(values: Float64Array) -> float | None:
 
 
 def _percentile(values: Float64Array, percent: float) -> float | None:
-    """None where there is no value, or none that is finite."""
+    """Percentile of the finite values; None if there are none."""
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 

@@ -1,4 +1,4 @@
-"""From judged episodes to the figures of the paper's Table 2, with an interval.
+"""Scores evaluated episodes as in the paper's Table 2, with a confidence interval.
 
 Invariant: the success, collision and time-out rates sum to 1. Pure.
 """
@@ -9,28 +9,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from mrcdrl.common.messages.trajectory import Evaluation, Outcome, Weights
-from mrcdrl.services.evaluator.trial import PER, EpisodeResult
+from mrcdrl.services.evaluator.trial import EPISODES_PER_BLOCK, EpisodeResult
 
-_Z95 = 1.959964  # of the normal distribution
+_Z95 = 1.959964  # quantile of the normal distribution for a two-sided 95 % interval
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:
-    """95 % interval of a rate (Wilson 1927)."""
+    """95 % confidence interval of a rate (Wilson 1927); (0, 1) without observations."""
     if count == 0:
         return (0.0, 1.0)
     rate, z2 = successes / count, _Z95**2
     centre = (rate + z2 / (2 * count)) / (1 + z2 / count)
     half = _Z95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
-    # At rates of 0 and 1 one bound is the rate itself; rounding would put it beside it.
+    # At rates of 0 and 1 one bound is the rate itself; rounding could miss it.
     return (min(rate, max(0.0, centre - half)), max(rate, min(1.0, centre + half)))
 
 
 def successes_per_100(results: Sequence[EpisodeResult]) -> list[float]:
-    """Successes of each full hundred; of fewer than a hundred, scaled to one."""
+    """Successes in each full block of 100; fewer than 100 episodes are scaled to 100."""
     won = np.array([r.outcome is Outcome.SUCCESS for r in results])
-    blocks = [won[i : i + PER] for i in range(0, len(won), PER)]
-    full = [b for b in blocks if len(b) == PER] or blocks[:1]
-    return [float(b.mean() * PER) for b in full]
+    size = EPISODES_PER_BLOCK
+    blocks = [won[i : i + size] for i in range(0, len(won), size)]
+    full = [b for b in blocks if len(b) == size] or blocks[:1]
+    return [float(b.mean() * size) for b in full]
 
 
 def evaluation(
@@ -42,7 +43,7 @@ def evaluation(
     seed: int,
     wall_s: float,
 ) -> Evaluation:
-    """The summary of these episodes."""
+    """Summarize these episodes for publication."""
     count = len(results)
     outcomes = [r.outcome for r in results]
     successes = outcomes.count(Outcome.SUCCESS)

@@ -1,7 +1,7 @@
-"""The paper's test (section 5.3): given starts, one collision is failure, success within time.
+"""The paper's test (section 5.3): fixed starts; one collision, or running out of time, fails.
 
-Invariants: the same starts, seed and weights give the same result; episodes are played many at
-once, each arena taking the next start when its episode ends.
+Invariants: the same starts, seed and weights give the same result. Many episodes are played at
+once; an arena takes the next start when its episode ends.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,19 +25,19 @@ from mrcdrl.common.model.policy import FrameStack, Policy
 from mrcdrl.services.evaluator.navigation import Journey, journey
 
 _MAX_ARENAS = 64
-PER = 100  # episodes a block of Table 2
+EPISODES_PER_BLOCK = 100  # of Table 2
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """One judged episode."""
+    """One evaluated episode."""
 
     outcome: Outcome
     frames: int
     score: float  # sum of rewards, mean over robots
     targets: Float64Array  # [M, 2] px
     obstacles: Float64Array  # [O, 3] px
-    robots: Float64Array  # [frames + 1, K, 3]; [0, K, 3] where paths are not kept
+    robots: Float64Array  # [frames + 1, K, 3]; [0, K, 3] if paths are not kept
     journey: Journey
 
 
@@ -45,20 +45,20 @@ class Player(Protocol):
     """Chooses the actions of several arenas at once."""
 
     def begin(self, arena: int, time_step: TimeStep) -> None:
-        """An episode starts in this arena."""
+        """Begin an episode in this arena."""
         ...
 
     def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
-        """Actions [len(arenas), K]."""
+        """Choose actions, [len(arenas), K]."""
         ...
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
-        """Records [len(arenas), K, R] after the step."""
+        """See the records after the step, [len(arenas), K, R]."""
         ...
 
 
 class PolicyPlayer:
-    """Plays from images alone."""
+    """Acts on images alone."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class PolicyPlayer:
 
 
 class ControllerPlayer:
-    """Plays by controllers that see the true state; explores like the policy does."""
+    """Acts by controllers that see the true state; explores as a policy does."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class ControllerPlayer:
         epsilon: float,
         rng: np.random.Generator,
     ) -> None:
-        """make_controller: called for every episode, as a controller plays one."""
+        """make_controller: called for each episode; a controller plays one."""
         self._make_controller = make_controller
         self._controllers: dict[int, Controller] = {}
         self._epsilon = epsilon
@@ -120,12 +120,12 @@ class ControllerPlayer:
         return np.where(explores, uniform, actions)
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
-        """Nothing to remember."""
+        """Ignore the images."""
 
 
 @dataclass(slots=True)
 class _Running:
-    """An episode under way."""
+    """An episode in progress."""
 
     number: int
     score: float = 0.0
@@ -138,14 +138,19 @@ def play(
     player: Player,
     *,
     keep_paths: bool = False,
-    go_on: Callable[[int], bool] = lambda _done: True,
+    keep_going: Callable[[int], bool] = lambda _done: True,
 ) -> list[EpisodeResult] | None:
-    """Results in the order of the starts; None where `go_on`, told how many are done, says no."""
+    """Play an episode from each start; return the results in the order of the starts.
+
+    keep_paths: keep each episode's poses. keep_going: called before each step with the number of
+    finished episodes; None is returned as soon as it returns False.
+    """
     num_arenas = min(len(starts), _MAX_ARENAS)
-    rngs = [np.random.default_rng(i) for i in range(num_arenas)]  # of failures; starts are given
+    # Starts are given; the generators serve random failures only.
+    rngs = [np.random.default_rng(i) for i in range(num_arenas)]
     arenas = ArenaBatch(config, rngs, max_collisions=1)
     results: dict[int, EpisodeResult] = {}
-    # One block: a million small ones that outlive the network's large ones would leave holes.
+    # One array: many small ones that outlive the network's tensors would fragment the memory.
     paths = np.empty((len(arenas), config.max_frames + 1, config.num_robots, 3), np.float64)
     waiting = iter(enumerate(starts))
     running: dict[int, _Running] = {}
@@ -162,7 +167,7 @@ def play(
     for index in range(len(arenas)):
         begin(index)
     while running:
-        if not go_on(len(results)):
+        if not keep_going(len(results)):
             return None
         active = np.array(sorted(running))
         scenes = [arenas.scene(i) for i in active]
@@ -194,7 +199,7 @@ def _result(
     *,
     keep_path: bool,
 ) -> EpisodeResult:
-    """Of an episode that went along this path [frames + 1, K, 3], to this scene and time step."""
+    """The result of an episode, from its path [frames + 1, K, 3], last scene and last time step."""
     if last.outcome is None:
         raise ValueError("the episode has not ended")
     return EpisodeResult(

@@ -1,1 +1,1 @@
-"""The router: relays between the processes of runs where replay does not listen itself."""
+"""The router: relays between the processes of runs, so that replay need not listen itself."""

@@ -1,4 +1,4 @@
-"""`mrcdrl router`: a Zenoh router, to which all processes of a run connect."""
+"""`mrcdrl router`: a Zenoh router that all processes of a run connect to."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -14,7 +14,7 @@ _TICK_S = 1.0
 
 
 def main(argv: Sequence[str]) -> int:
-    """Relay until told to stop; the exit code."""
+    """Relay until told to stop; return the exit code."""
     parser = Parser(prog="mrcdrl router", description="Relay between the processes of runs.")
     parser.add_argument(
         "--config", type=Path, default=ROUTER_FILE, help="a file such as configs/router.json5"
@@ -22,10 +22,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--listen",
         action="append",
-        help="endpoint, such as tcp/0.0.0.0:7447; by default the file's",
+        help="endpoint, such as tcp/0.0.0.0:7447; default: the file's",
     )
     parser.add_argument(
-        "--connect", action="append", help="another router's endpoint, to link to when it is there"
+        "--connect", action="append", help="another router's endpoint, linked to once it is up"
     )
     add_config_flags(parser, only=("transport",))
     arguments = parser.parse_args(argv)

@@ -18,49 +18,57 @@ from mrcdrl.services.tools.subject import Subject, subject, subject_parser
 
 
 def main(argv: Sequence[str]) -> int:
-    """Evaluate and print; the exit code."""
+    """Evaluate and print; return the exit code."""
     parser = subject_parser("evaluate", "The paper's test: one collision fails, epsilon 0.01.")
-    parser.add_argument("--episodes", type=int, default=1100, help="starts; the paper's 1100")
-    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
+    parser.add_argument(
+        "--episodes",
+        type=int,
+        default=1100,
+        help="number of starts; default: 1100, as in the paper",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the starts and the exploration"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     arguments = parser.parse_args(argv)
     if arguments.episodes < 1:
         parser.error(f"--episodes {arguments.episodes}: at least 1")
-    judged = subject(arguments)
+    evaluated = subject(arguments)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("episodes", total=arguments.episodes)
-        result, measures = judge(
-            judged,
+        result, measures = evaluate(
+            evaluated,
             arguments.episodes,
             arguments.seed,
             lambda done: progress.update(task, completed=done),
         )
     if arguments.json:
-        navigated = {"navigation": dataclasses.asdict(measures)}
-        print(json.dumps(dataclasses.asdict(result) | navigated))
+        measured = {"navigation": dataclasses.asdict(measures)}
+        print(json.dumps(dataclasses.asdict(result) | measured))
     else:
-        sys.stdout.write(table(result, judged) + navigation_table(measures))
+        sys.stdout.write(table(result, evaluated) + navigation_table(measures))
     return 0
 
 
-def judge(
-    judged: Subject, episodes: int, seed: int, report: Callable[[int], None]
+def evaluate(
+    evaluated: Subject, episodes: int, seed: int, report: Callable[[int], None]
 ) -> tuple[Evaluation, Navigation]:
-    """The paper's measures and those of navigation; `report` is told how many episodes are done."""
+    """The paper's measures and those of navigation; report: called with the episodes finished."""
     began_s = time.monotonic()
-    starts = test_starts(judged.config.arena, episodes, seed)
+    starts = test_starts(evaluated.config.arena, episodes, seed)
 
-    def go_on(done: int) -> bool:
+    def keep_going(done: int) -> bool:
         report(done)
         return True
 
-    results = play(judged.config.arena, starts, judged.player(seed), go_on=go_on) or []
+    player = evaluated.player(seed)
+    results = play(evaluated.config.arena, starts, player, keep_going=keep_going) or []
     result = evaluation(
         results,
-        worker=judged.controller or "evaluate",
-        weights=judged.weights,
-        num_robots=judged.config.arena.num_robots,
+        worker=evaluated.controller or "evaluate",
+        weights=evaluated.weights,
+        num_robots=evaluated.config.arena.num_robots,
         seed=seed,
         wall_s=time.monotonic() - began_s,
     )
@@ -68,16 +76,17 @@ def judge(
     return result, navigation(outcomes, frames, [r.journey for r in results])
 
 
-def table(result: Evaluation, judged: Subject) -> str:
-    """The result for a reader."""
+def table(result: Evaluation, evaluated: Subject) -> str:
+    """Format the result for a terminal."""
     low, high = result.success_interval
+    epsilon = evaluated.config.evaluator.epsilon
     who = (
-        f"controller {judged.controller}, which sees the true state"
-        if judged.controller
+        f"controller {evaluated.controller}, which sees the true state"
+        if evaluated.controller
         else f"weights of learner step {result.learner_step}, from images alone"
     )
     return f"""{who}
-{result.num_robots} robots, {result.episodes} episodes, epsilon {judged.config.evaluator.epsilon:g}
+{result.num_robots} robots, {result.episodes} episodes, epsilon {epsilon:g}
   success    {result.success_rate:7.2%}   (95 % interval {low:.2%} to {high:.2%})
   collision  {result.collision_rate:7.2%}
   time-out   {result.timeout_rate:7.2%}

@@ -12,7 +12,7 @@ from mrcdrl.common.model.policy import Policy, make_policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import SENT_AS, network_from_bytes, weights_to_bytes
-from mrcdrl.services.evaluator.evaluator import Best
+from mrcdrl.services.evaluator.evaluator import BestWeights
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def result(version: int, rate: float, frames: float) -> Evaluation:
     )
 
 
-def offer(best: Best, version: int, rate: float, frames: float) -> None:
+def offer(best: BestWeights, version: int, rate: float, frames: float) -> None:
     weights = Weights.of(0, version, 10 * version, f"weights {version}".encode())
     best.offer(weights, result(version, rate, frames))
 
@@ -70,37 +70,37 @@ def kept(path: Path) -> str:
 def test_more_successes_or_as_many_in_less_time_are_kept(
     path: Path, offers: list[tuple[float, float]], expected: int, restarts: bool
 ) -> None:
-    best = Best(path)
+    best = BestWeights(path)
     for version, (rate, frames) in enumerate(offers):
         offer(best, version, rate, frames)
-        best = Best(path) if restarts else best
+        best = BestWeights(path) if restarts else best
     assert kept(path) == f"weights {expected}"
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "float16"])
-def test_the_kept_weights_give_the_values_that_were_judged(path: Path, precision: str) -> None:
+def test_the_kept_weights_give_the_values_that_were_evaluated(path: Path, precision: str) -> None:
     small = {"arena.view_px": "32", "learner.precision": "float32"}
-    judged = make_policy(load_config("smoke", small, environ={}))
+    evaluated = make_policy(load_config("smoke", small, environ={}))
     payload = weights_to_bytes(QNetwork("duel", view_px=32), SENT_AS[precision])
     weights = Weights.of(0, 1, 10, payload)
-    judged.adopt(weights)
-    Best(path).offer(weights, result(1, 0.5, 90))
+    evaluated.adopt(weights)
+    BestWeights(path).offer(weights, result(1, 0.5, 90))
     kept_payload, manifest = read_weights(path)
     assert manifest["sha256"] == weights.digest
     states = np.random.default_rng(0).integers(0, 256, (5, 4, 32, 32), dtype=np.uint8)
     loaded = Policy(network_from_bytes(kept_payload))
-    np.testing.assert_array_equal(loaded.q_values(states), judged.q_values(states))
+    np.testing.assert_array_equal(loaded.q_values(states), evaluated.q_values(states))
 
 
-def test_of_kept_weights_nothing_is_known_where_the_file_beside_is_torn(path: Path) -> None:
-    offer(Best(path), 0, 0.9, 50)
+def test_a_torn_manifest_tells_nothing_of_the_kept_weights(path: Path) -> None:
+    offer(BestWeights(path), 0, 0.9, 50)
     path.with_suffix(".json").write_text("{")
-    offer(Best(path), 1, 0.1, 50)
+    offer(BestWeights(path), 1, 0.1, 50)
     assert kept(path) == "weights 1"
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").write_text("a file in its place")
-    best = Best(tmp_path / "checkpoints" / "best.safetensors")
+    best = BestWeights(tmp_path / "checkpoints" / "best.safetensors")
     with pytest.raises(CheckpointError, match="not written"):
         offer(best, 0, 0.5, 50)

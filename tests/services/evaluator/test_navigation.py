@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrcdrl.common.arena import STRAIGHT, Scene, Start, layout_for
-from mrcdrl.common.arena.controllers import controller
+from mrcdrl.common.arena.controllers import make_controller
 from mrcdrl.common.arena.world import starts
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
@@ -74,6 +74,7 @@ def test_measures_by_hand() -> None:
     text = navigation_table(measures)
     assert "collision with a robot  20.00%, with a wall alone 20.00%" in text
     assert "robot 1" in text
+    assert "path length ÷ straight line" in text
 
 
 @given(
@@ -109,7 +110,7 @@ def test_rates_sum_to_1_and_nothing_is_nan(ended: list[tuple[Outcome, bool, bool
         ([(40, 300, np.pi), (300, 100, 0)], [False, False], [True, False]),
     ],
 )
-def test_play_tells_whom_a_robot_ran_into(
+def test_play_tells_what_a_robot_ran_into(
     robots: list[tuple[float, float, float]], hit_robot: list[bool], hit_wall: list[bool]
 ) -> None:
     config = ArenaConfig()
@@ -127,10 +128,10 @@ def test_play_tells_whom_a_robot_ran_into(
     assert len(result.robots) == 0
 
 
-def test_what_is_played_is_measured() -> None:
+def test_journeys_match_the_paths_played() -> None:
     config = ArenaConfig()
     rng = np.random.default_rng(0)
-    player = ControllerPlayer(lambda: controller("safe_circle", config, rng), 0.0, rng)
+    player = ControllerPlayer(lambda: make_controller("safe_circle", config, rng), 0.0, rng)
     results = play(config, starts.test_starts(config, 4, 0), player, keep_paths=True) or []
     for result in results:
         ways = np.linalg.norm(np.diff(result.robots[..., :2], axis=0), axis=2).sum(axis=0)

@@ -20,7 +20,7 @@ def episode(outcome: Outcome, frames: int = 10, score: float = 1.0) -> EpisodeRe
     )
 
 
-def judged(results: list[EpisodeResult]) -> Evaluation:
+def summarized(results: list[EpisodeResult]) -> Evaluation:
     return evaluation(
         results,
         worker="evaluator-0",
@@ -33,7 +33,7 @@ def judged(results: list[EpisodeResult]) -> Evaluation:
 
 @given(st.lists(st.sampled_from(Outcome), min_size=1, max_size=350))
 def test_rates_sum_to_1_and_the_interval_holds_the_rate(outcomes: list[Outcome]) -> None:
-    result = judged([episode(outcome) for outcome in outcomes])
+    result = summarized([episode(outcome) for outcome in outcomes])
     assert result.success_rate + result.collision_rate + result.timeout_rate == pytest.approx(1)
     assert result.success_rate == outcomes.count(SUCCESS) / len(outcomes)
     low, high = result.success_interval
@@ -68,25 +68,27 @@ def test_blocks_of_a_hundred() -> None:
     won, lost = episode(SUCCESS), episode(COLLISION)
     blocks = [won] * 90 + [lost] * 10 + [won] * 70 + [lost] * 30 + [won] * 50
     assert successes_per_100(blocks) == [90.0, 70.0]
-    result = judged(blocks)
+    result = summarized(blocks)
     assert (result.max_per_100, result.mean_per_100, result.variance_per_100) == (90, 80, 100)
     assert result.success_rate == 210 / 250
 
 
 def test_fewer_than_a_hundred_are_scaled_to_one() -> None:
     assert successes_per_100([episode(SUCCESS)] * 3 + [episode(TIMEOUT)]) == [75.0]
-    assert judged([episode(TIMEOUT)] * 7).variance_per_100 == 0
+    assert summarized([episode(TIMEOUT)] * 7).variance_per_100 == 0
 
 
 def test_frames_are_those_to_success_and_the_score_is_that_of_all() -> None:
-    result = judged([episode(SUCCESS, 100, 5.0), episode(SUCCESS, 50, 1.0), episode(TIMEOUT, 999)])
+    result = summarized(
+        [episode(SUCCESS, 100, 5.0), episode(SUCCESS, 50, 1.0), episode(TIMEOUT, 999)]
+    )
     assert result.mean_frames == 75
     assert result.mean_score == pytest.approx(7 / 3)
-    assert judged([episode(COLLISION)]).mean_frames == 0
+    assert summarized([episode(COLLISION)]).mean_frames == 0
 
 
-def test_what_was_judged_is_written_along() -> None:
-    result = judged([episode(SUCCESS)])
+def test_the_evaluation_names_its_weights_and_seed() -> None:
+    result = summarized([episode(SUCCESS)])
     assert (result.worker, result.weights_epoch, result.weights_version) == ("evaluator-0", 1, 7)
     assert (result.learner_step, result.num_robots, result.episodes) == (700, 2, 1)
     assert (result.seed, result.wall_s) == (5, 2.5)

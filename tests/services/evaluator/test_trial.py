@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from mrcdrl.common.arena import LEFT, STRAIGHT, Scene, Start, layout_for, make_codec, test_starts
-from mrcdrl.common.arena.controllers import controller
+from mrcdrl.common.arena.controllers import make_controller
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Outcome, TimeStep, UInt8Array
 from mrcdrl.common.model.policy import Policy
@@ -42,7 +42,7 @@ class SteadyPlayer:
 
 def controlled(name: str, epsilon: float = 0.0, seed: int = 0) -> ControllerPlayer:
     rng = np.random.default_rng(seed)
-    return ControllerPlayer(lambda: controller(name, CONFIG, rng), epsilon, rng)
+    return ControllerPlayer(lambda: make_controller(name, CONFIG, rng), epsilon, rng)
 
 
 def by_policy(epsilon: float) -> PolicyPlayer:
@@ -127,11 +127,11 @@ def test_no_starts_no_results() -> None:
 def test_it_ends_when_told_to_and_says_how_far_it_is() -> None:
     told: list[int] = []
 
-    def go_on(done: int) -> bool:
+    def keep_going(done: int) -> bool:
         told.append(done)
         return done < 2
 
     starts = [TOWARDS, TOWARDS, APART]
-    assert play(CONFIG, starts, SteadyPlayer(STRAIGHT), go_on=go_on) is None
+    assert play(CONFIG, starts, SteadyPlayer(STRAIGHT), keep_going=keep_going) is None
     assert told[0] == 0
     assert told[-1] == 2
