@@ -74,7 +74,7 @@ def main() -> None:
     elif arguments.step or not (arguments.rounds and (arguments.peers or on_gpu(arguments))):
         emit(ours(arguments))
     else:
-        found = in_lockstep(arguments)
+        found = alternately(arguments)
         for name, results in found.items():
             cells = (
                 f"b{size} {median(figure(r, size) for r in results):8.1f}"
@@ -83,7 +83,7 @@ def main() -> None:
             sys.stderr.write(f"{name:24}" + "   ".join(cells) + "\n")
 
 
-def in_lockstep(arguments: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+def alternately(arguments: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     """Results by system, a round after the other; each is printed as it comes."""
     timing = [f"--{name}={getattr(arguments, name)}" for name in ("threads", "seconds", "reps")]
     module = [sys.executable, "-m", "benchmarks.learner", *timing, "--batches"]

@@ -23,9 +23,10 @@ from mrcdrl.services.actor.collector import Collector
 from mrcdrl.services.learner.batch import collate
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.rendering import make_renderer
-from mrcdrl.services.replay.build import build
 from mrcdrl.services.replay.client import ReplayReader, ReplayWriter
+from mrcdrl.services.replay.limiter import RateLimiter
 from mrcdrl.services.replay.service import ReplayService
+from mrcdrl.services.replay.table import Table
 
 MICRO = 1e6
 
@@ -54,16 +55,9 @@ def main() -> None:
 def make_collector(config: Config) -> Collector:
     rngs = [np.random.default_rng(i) for i in range(config.actor.num_arenas)]
     arenas = ArenaBatch(config.arena, rngs)
-    origin = ChunkerConfig(
-        actor="bench",
-        incarnation=1,
-        gamma=config.agent.gamma,
-        n_step=config.agent.n_step,
-        stack=config.arena.stack,
-        chunk_length=config.actor.chunk_length,
-    )
+    chunking = ChunkerConfig.from_config(config, "bench", incarnation=1)
     rng = np.random.default_rng(0)
-    return Collector(config, origin, arenas, make_codec(config.arena), make_policy(config), rng)
+    return Collector(config, chunking, arenas, make_codec(config.arena), make_policy(config), rng)
 
 
 def collecting(config: Config, collector: Collector, timing: dict[str, float]) -> dict[str, object]:
@@ -96,12 +90,10 @@ def collect_chunks(config: Config, collector: Collector) -> list[Chunk]:
 
 def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> dict[str, object]:
     """Microseconds of an insert, a sampled batch, its decoding, and an update."""
-    learner = Learner(
-        config.agent, config.learner, stack=config.arena.stack, view_px=config.arena.view_px
-    )
+    learner = Learner.from_config(config)
     keys, stop = Keys("bench"), StopSignal()
     endpoint = free_endpoint()
-    table, limiter = build(config)
+    table, limiter = Table.from_config(config), RateLimiter.from_config(config)
     with (
         Session(TransportConfig(listen=(endpoint,))) as served,
         Session(TransportConfig(connect=(endpoint,))) as session,
@@ -125,13 +117,13 @@ def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> d
         service.stop()
     if sampled is None:
         raise RuntimeError("no mini-batch came")
-    draw = make_renderer(config.arena, learner.device)
+    render = make_renderer(config.arena, learner.device)
     symmetries = layout_symmetries(config.arena)
 
     def collated() -> object:
-        return collate(sampled, draw, config.arena.stack, symmetries=symmetries, rng=learner.rng)
+        return collate(sampled, render, config.arena.stack, symmetries=symmetries, rng=learner.rng)
 
-    batch = collate(sampled, draw, config.arena.stack)
+    batch = collate(sampled, render, config.arena.stack)
     return {
         "insert_us_per_chunk": spread([s * MICRO for s in inserts]),
         "sample_us_per_batch": spread([s * MICRO for s in samples]),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array, Weights
+from mrcdrl.common.model.fast_forward import fast_forward, operands, prepare
 from mrcdrl.common.model.q_network import QNetwork, precision
 from mrcdrl.common.model.weights_io import load_weights
 
@@ -38,7 +39,7 @@ class Policy:
     def __init__(self, network: QNetwork) -> None:
         self.network = network.eval().requires_grad_(requires_grad=False)
         self._device = next(network.parameters()).device
-        self._operands = network.operands()
+        self._operands = operands(network)
         self.weights_epoch = -1  # -1: initial parameters, none adopted yet
         self.weights_version = -1
         self.learner_step = 0
@@ -55,7 +56,7 @@ class Policy:
         Raises CheckpointError if they are not this network's; the old ones stay.
         """
         load_weights(self.network, weights.payload)
-        self._operands = self.network.operands()
+        self._operands = operands(self.network)
         self.weights_epoch = weights.epoch
         self.weights_version = weights.version
         self.learner_step = weights.learner_step
@@ -64,8 +65,8 @@ class Policy:
         """Values float32 [N, num_actions] of states uint8 [N, S, V, V]."""
         states = torch.from_numpy(np.require(observations, requirements=["C", "W"]))
         with torch.inference_mode():
-            prepared = self.network.prepare(states.to(self._device))
-            values = self.network.evaluate(prepared, self._operands)
+            prepared = prepare(self.network, states.to(self._device))
+            values = fast_forward(self.network, prepared, self._operands)
             array: Float32Array = values.cpu().numpy()
         return array
 

@@ -1,14 +1,15 @@
-"""The paper's action-value network (section 5.1, Fig. 4) and its parameters as bytes.
+"""The paper's action-value network (section 5.1, Fig. 4), as it reads.
 
-Invariants: parameters are float32 whatever precision they are computed or sent in; the output
-layers and their sum are computed in float32 always (the gap between actions is about 1 % of Q,
-below what bfloat16 resolves); the three kinds differ in their streams only; bytes that do not
-fit are refused.
+`fast_forward.py` computes the same values several times as fast, for learner and actors; this is
+its oracle, and what `mrcdrl export` writes.
+
+Invariants: parameters are float32 whatever precision they are computed in; the output layers and
+their sum are computed in float32 always (the gap between actions is about 1 % of Q, below what
+bfloat16 resolves); the three kinds differ in their streams only.
 
 Shapes: B = states of a batch, S = images stacked in a state, V = width of an image in px.
 """
 
-from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import torch
@@ -17,28 +18,12 @@ from torch.nn import functional
 
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import NUM_ACTIONS
-from mrcdrl.common.model.kernels.sparse_conv import NonzeroPixels, first_layer, nonzero_pixels
-from mrcdrl.common.model.kernels.tensor_core_conv import Images, images_on_gpu
-from mrcdrl.common.model.kernels.tensor_core_conv import first_layer as first_layer_on_gpu
 
 Kind = Literal["duel", "ddqn", "dqn"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
 HIDDEN_UNITS: Final = 512
-_WHITE: Final = 255.0
-_FLOAT32 = ("conv1.", "value.", "advantage.", "action_value.")  # operands that are it always
-
-States = Tensor | NonzeroPixels | Images  # as the first layer takes them
-Operands = dict[str, Tensor]  # by parameter name
-
-
-@dataclass(frozen=True, slots=True)
-class Trace:
-    """What an evaluation passed through."""
-
-    units: list[Tensor] = field(default_factory=list)  # outputs of each hidden layer
-    # of fully connected ones, by their weight's name: inputs [B, F], and sums before ReLU [B, U]
-    products: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
+WHITE: Final = 255.0
 
 
 def precision(setting: Precision, device: str | torch.device = "cpu") -> torch.dtype:
@@ -121,88 +106,30 @@ class QNetwork(nn.Module):
         else:
             self.hidden = nn.Linear(features, HIDDEN_UNITS)
             self.action_value = nn.Linear(HIDDEN_UNITS, num_actions)
-        hidden = ("value_hidden", "advantage_hidden") if kind == "duel" else ("hidden",)
-        self.hidden_weights = tuple(f"{name}.weight" for name in hidden)  # nearly all parameters
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Values float32 [B, num_actions] of states uint8 [B, S, V, V], by torch alone."""
-        return self.evaluate(self._dense(observation), self.operands())
+        """Values float32 [B, num_actions] of states uint8 [B, S, V, V].
 
-    def prepare(self, observation: Tensor) -> States:
-        """States uint8 [B, S, V, V] as the first layer is fastest on them.
-
-        On a CPU those that are mostly black are what is not black of them; on a GPU that computes
-        in bfloat16 they are left as they are, where its kernels can be had.
+        White is 1: dividing the first kernel by 255 is the same as dividing the images, which stay
+        exact integers, also in bfloat16. Pooling before the ReLU is the same as after it.
         """
-        given: States | None = None
-        if observation.device.type == "cpu":
-            given = nonzero_pixels(observation)
-        elif observation.device.type == "cuda" and self.compute_dtype == torch.bfloat16:
-            given = images_on_gpu(observation)
-        return self._dense(observation) if given is None else given
-
-    def _dense(self, observation: Tensor) -> Tensor:
-        """In the dtype and memory order of a convolution.
-
-        In two passes: converting and reordering at once is twice as slow on a CPU.
-        """
-        return observation.to(self.compute_dtype).contiguous(memory_format=torch.channels_last)
-
-    def operands(self) -> Operands:
-        """The parameters as `evaluate` takes them, with gradient; valid until they change.
-
-        White is 1: dividing the first kernel by 255 is the same as dividing the images, which
-        stay exact integers, also in bfloat16.
-        """
-        operands: Operands = dict(self.named_parameters())
-        operands["conv1.weight"] = operands["conv1.weight"] / _WHITE
-        for name, parameter in operands.items():
-            if not name.startswith(_FLOAT32):
-                operands[name] = parameter.to(self.compute_dtype)
-        return operands
-
-    def scale_gradients(self, gradients: Operands) -> None:
-        """From those of the operands to those of the parameters, in place."""
-        gradients["conv1.weight"] /= _WHITE
-
-    def evaluate(self, states: States, operands: Operands, trace: Trace | None = None) -> Tensor:
-        """Values float32 [B, num_actions] of what `prepare` and `operands` returned.
-
-        Pooling before the ReLU is the same as after it, on a quarter of the numbers. trace: is
-        filled, if given.
-        """
-        trace = trace or Trace()
-        weight, bias = operands["conv1.weight"], operands["conv1.bias"]
-        if isinstance(states, NonzeroPixels):
-            x = first_layer(states, weight, bias).to(self.compute_dtype)
-        elif isinstance(states, Images):
-            x = first_layer_on_gpu(states, weight, bias)
-        else:
-            weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)
-            x = functional.max_pool2d(functional.conv2d(states, weight, bias, stride=2), 2)
-            x = functional.relu_(x)
-        trace.units.append(x)
-        x = functional.conv2d(x, operands["conv2.weight"], operands["conv2.bias"], stride=2)
-        x = functional.relu_(x)
-        trace.units.append(x)
-        x = functional.conv2d(x, operands["conv3.weight"], operands["conv3.bias"])
-        x = functional.relu_(x)
-        trace.units.append(x)
+        dtype = self.compute_dtype
+        x = observation.to(dtype).contiguous(memory_format=torch.channels_last)
+        weight, bias = self.conv1.parameters()
+        x = functional.conv2d(x, (weight / WHITE).to(dtype), bias.to(dtype), stride=2)
+        x = functional.relu(functional.max_pool2d(x, 2))
+        for layer in (self.conv2, self.conv3):
+            weight, bias = (p.to(dtype) for p in layer.parameters())
+            x = functional.relu(functional.conv2d(x, weight, bias, layer.stride))
         features = x.flatten(1)
-        if self.kind == "duel":
-            value = _stream(features, operands, "value_hidden", "value", trace)
-            advantage = _stream(features, operands, "advantage_hidden", "advantage", trace)
-            return value + advantage - advantage.mean(dim=1, keepdim=True)
-        return _stream(features, operands, "hidden", "action_value", trace)
+        if self.kind != "duel":
+            return self._stream(features, self.hidden, self.action_value)
+        value = self._stream(features, self.value_hidden, self.value)
+        advantage = self._stream(features, self.advantage_hidden, self.advantage)
+        return value + advantage - advantage.mean(dim=1, keepdim=True)  # Eq. (1)
 
-
-def _stream(features: Tensor, operands: Operands, hidden: str, output: str, trace: Trace) -> Tensor:
-    """A hidden layer and, in float32, an output layer."""
-    weight = f"{hidden}.weight"
-    sums = functional.linear(features, operands[weight], operands[f"{hidden}.bias"])
-    units = functional.relu(sums)
-    trace.units.append(units)
-    trace.products[weight] = features, sums
-    return functional.linear(
-        units.float(), operands[f"{output}.weight"], operands[f"{output}.bias"]
-    )
+    def _stream(self, features: Tensor, hidden: nn.Linear, output: nn.Linear) -> Tensor:
+        """A hidden layer and, in float32, an output layer."""
+        weight, bias = (p.to(self.compute_dtype) for p in hidden.parameters())
+        units: Tensor = output(functional.relu(functional.linear(features, weight, bias)).float())
+        return units

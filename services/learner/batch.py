@@ -1,7 +1,7 @@
 """From sampled records to the tensors of one learner step.
 
-Invariants: every record is drawn once; a transition's images and its action undergo the same
-symmetry; stacking states out of single images happens here only.
+Invariants: every record is rendered once; a transition's images and its action undergo the same
+symmetry; states are stacked out of single images here only.
 
 Shapes: B = transitions, W = records a transition may touch, R = bytes of a record, S = images
 stacked in a state, V = width of an image in px.
@@ -9,10 +9,12 @@ stacked in a state, V = width of an image in px.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, Generic, Self
 
 import numpy as np
 import torch
+from torch import Tensor
+from typing_extensions import TypeVar
 
 from mrcdrl.common.arena import Symmetry
 from mrcdrl.common.config import ReplayConfig
@@ -21,28 +23,47 @@ from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples
 from mrcdrl.services.learner.rendering import Renderer, SymmetryRows, to_device
 
+S = TypeVar("S", default=Tensor)
+T = TypeVar("T")
+
 
 @dataclass(frozen=True, slots=True)
-class Batch:
-    """What one learner step reads."""
+class Batch(Generic[S]):
+    """What one learner step reads; states are tensors, or what a fast first layer takes."""
 
-    observation: torch.Tensor  # uint8 [B, S, V, V], may be a view with strides
-    action: torch.Tensor  # int64 [B]
-    reward: torch.Tensor  # float32 [B], n-step return
-    discount: torch.Tensor  # float32 [B], gamma**k, 0 after a termination
-    next_observation: torch.Tensor  # uint8 [B, S, V, V], k steps later
-    importance_weights: torch.Tensor  # float32 [B], largest is 1
+    observation: S  # uint8 [B, S, V, V], may be a view with strides
+    action: Tensor  # int64 [B]
+    reward: Tensor  # float32 [B], n-step return
+    discount: Tensor  # float32 [B], gamma**k, 0 after a termination
+    next_observation: S  # uint8 [B, S, V, V], k steps later
+    importance_weights: Tensor  # float32 [B], largest is 1
     keys: Int64Array  # [B], of the transitions in replay
 
     @property
-    def tensors(self) -> tuple[torch.Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """All but the keys."""
         return tuple(getattr(self, name) for name in _TENSORS)
 
-    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Self:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The batch with each of its tensors changed, and the same keys."""
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _TENSORS}
         return replace(self, **changed)
+
+    def __getitem__(self, rows: slice) -> Self:
+        """Some of its transitions, as views."""
+        return replace(self.map(lambda x: x[rows]), keys=self.keys[rows])
+
+    def with_states(self, change: Callable[[S], T]) -> "Batch[T]":
+        """The batch with its states in another form."""
+        return Batch(
+            change(self.observation),
+            self.action,
+            self.reward,
+            self.discount,
+            change(self.next_observation),
+            self.importance_weights,
+            self.keys,
+        )
 
 
 _TENSORS = tuple(field.name for field in fields(Batch) if field.name != "keys")
@@ -64,14 +85,14 @@ def importance_weights(samples: Samples, beta: float) -> Float32Array:
 
 def collate(
     samples: Samples,
-    draw: Renderer,
+    render: Renderer,
     stack: int,
     *,
     symmetries: Sequence[Symmetry] = (),
     rng: np.random.Generator | None = None,
     beta: float = 0.0,
 ) -> Batch:
-    """The batch of these samples, on the device of the drawing.
+    """The batch of these samples, on the renderer's device.
 
     symmetries: one is drawn by rng for each transition; include the identity among them. beta:
     of the importance weights; 0 makes them 1.
@@ -83,7 +104,7 @@ def collate(
     actions = samples.actions.copy()
     for symmetry, rows in symmetry_rows:
         actions[rows] = symmetry.apply_to_actions(actions[rows])
-    images = draw(samples.records, symmetry_rows)
+    images = render(samples.records, symmetry_rows)
     device = images.device
     offsets = to_device(samples.bootstrap_offsets.astype(np.int64), device)
     each = torch.arange(len(samples), device=device)[:, None]

@@ -1,8 +1,8 @@
-"""Signs that learning goes astray, told while it can still be mended.
+"""Signs that learning goes wrong, reported while it can still be fixed.
 
-Invariants: looks only, and changes nothing; one inference on a few states and one transfer from
-the device for each look, so that a look a second costs next to nothing; a warning is logged once
-until its cause has gone; histograms have the same bins for as long as the run lasts.
+Invariants: looks only, and changes nothing. One look is one inference on a few states and one
+transfer from the device, so that a look a second costs next to nothing. A warning is logged once
+until its cause has gone. Histograms keep their bins for as long as the run lasts.
 """
 
 import logging
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mrcdrl.common.config import Config
+from mrcdrl.common.messages.metrics import NUM_BINS, Bins, DiagnosticMetrics
 from mrcdrl.common.messages.trajectory import Float32Array
-from mrcdrl.common.model.q_network import Trace
+from mrcdrl.common.model.fast_forward import Trace, fast_forward, operands, prepare
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.learner import Learner
-from mrcdrl.services.learner.loss import Update
+from mrcdrl.services.learner.step import Update
 
 _LOG = logging.getLogger("learner")
 _STATES = 64  # of a batch that are looked at
@@ -26,8 +27,8 @@ _TOO_LARGE = 2.0  # times the largest return
 _TOO_DEAD = 0.9
 
 # Between the bins of a histogram, in largest returns
-_Q_EDGES = np.linspace(-1.0, 1.0, 9)
-_TD_ERROR_EDGES = 10.0 ** np.linspace(-4.0, 0.0, 9)
+_Q_EDGES = np.linspace(-1.0, 1.0, NUM_BINS - 1)
+_TD_ERROR_EDGES = 10.0 ** np.linspace(-4.0, 0.0, NUM_BINS - 1)
 _LOOKS_A_HISTOGRAM = 15
 
 
@@ -39,15 +40,13 @@ class Diagnostics:
         self._largest_return = largest_return(config)
         self._warned: set[str] = set()
         self._looks = 0
-        self._histograms = {
-            "q": Histogram(_Q_EDGES * self._largest_return),
-            "td_error": Histogram(_TD_ERROR_EDGES * self._largest_return),
-        }
+        self._q_histogram = Histogram(_Q_EDGES * self._largest_return)
+        self._td_error_histogram = Histogram(_TD_ERROR_EDGES * self._largest_return)
 
-    def look(self, batch: Batch, update: Update) -> dict[str, float]:
-        """Metrics by name after a step on this batch; logs what is alarming.
+    def look(self, batch: Batch, update: Update) -> DiagnosticMetrics:
+        """Metrics after a step on this batch; logs what is alarming.
 
-        Histograms are of the looks since the last ones, with the first and then each 15th.
+        Histograms come with the first look and each 15th after it, and cover the looks between.
         """
         values, dead = self._infer(batch.observation[:_STATES])
         network = torch.stack([dead, self._drift()])
@@ -67,39 +66,41 @@ class Diagnostics:
             "units",
             dead_share > _TOO_DEAD,
             f"{dead_share:.0%} of the network's units are 0 whatever they see: little can be "
-            "learned any more; lower agent.learning_rate and start anew",
+            "learned any more; lower agent.learning_rate and start a new run",
         )
-        return {
-            "loss": loss,
-            "mean_q": mean_q,
-            "td_error_mean": errors.mean(),
-            "gradient_norm": gradient_norm,
-            "loss_finite": math.isfinite(loss),
-            "q_min": q_min,
-            "q_p50": q_p50,
-            "q_max": q_max,
-            "td_error_p50": error_p50,
-            "td_error_p90": error_p90,
-            "td_error_p99": error_p99,
-            "dead_share": dead_share,
-            "target_drift": target_drift,
-            **self._binned(q=q, td_error=errors),
-        }
+        q_bin, td_error_bin = self._binned(q, errors)
+        return DiagnosticMetrics(
+            loss=float(loss),
+            mean_q=float(mean_q),
+            td_error_mean=float(errors.mean()),
+            gradient_norm=float(gradient_norm),
+            loss_finite=math.isfinite(loss),
+            q_min=float(q_min),
+            q_p50=float(q_p50),
+            q_max=float(q_max),
+            td_error_p50=float(error_p50),
+            td_error_p90=float(error_p90),
+            td_error_p99=float(error_p99),
+            dead_share=float(dead_share),
+            target_drift=float(target_drift),
+            q_bin=q_bin,
+            td_error_bin=td_error_bin,
+        )
 
     def _infer(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Values [B, A], and the share of hidden units that are 0 for all these states.
 
-        Of a convolution the units are its channels.
+        The units of a convolution are its channels.
         """
         network = self._learner.online
         trace = Trace()
         with torch.no_grad():
-            q = network.evaluate(network.prepare(states), network.operands(), trace)
+            q = fast_forward(network, prepare(network, states), operands(network), trace)
         dead = torch.cat([x.transpose(0, 1).flatten(1).amax(1) <= 0 for x in trace.units])
         return q, dead.float().mean()
 
     def _drift(self) -> Tensor:
-        """Distance of the online parameters from the target's, relative to the latter's length."""
+        """Distance of the online parameters from the target's, relative to the target's norm."""
         online, target = self._learner.online.parameters(), self._learner.target.parameters()
         with torch.no_grad():
             pairs = [(p - t, t) for p, t in zip(online, target, strict=True)]
@@ -107,18 +108,14 @@ class Diagnostics:
             length = torch.nn.utils.get_total_norm([parameter for _, parameter in pairs])
         return far / length
 
-    def _binned(self, **values: Float32Array) -> dict[str, float]:
-        """The histograms, where it is time for them."""
-        for name, histogram in self._histograms.items():
-            histogram.add(values[name])
+    def _binned(self, q: Float32Array, errors: Float32Array) -> tuple[Bins, Bins]:
+        """The histograms of values and errors when they are due, else empty ones."""
+        self._q_histogram.add(q)
+        self._td_error_histogram.add(errors)
         self._looks += 1
         if self._looks % _LOOKS_A_HISTOGRAM != 1:
-            return {}
-        return {
-            f"{name}_bin_{i}": share
-            for name, histogram in self._histograms.items()
-            for i, share in enumerate(histogram.take())
-        }
+            return (), ()
+        return self._q_histogram.take(), self._td_error_histogram.take()
 
     def _warn(self, cause: str, alarming: bool, text: str) -> None:
         if alarming and cause not in self._warned:
@@ -138,15 +135,15 @@ class Histogram:
         bins = np.searchsorted(self._edges, values[~np.isnan(values)], side="right")
         self._counts += np.bincount(bins, minlength=len(self._counts))
 
-    def take(self) -> list[float]:
+    def take(self) -> Bins:
         """The share of each bin in all since the last time; zeros where there were no values."""
         shares = self._counts / max(self._counts.sum(), 1.0)
         self._counts[:] = 0
-        return [float(share) for share in shares]
+        return tuple(float(share) for share in shares)
 
 
 def largest_return(config: Config) -> float:
-    """A bound of what any state is worth, in scaled rewards: all that an episode may bring."""
+    """A bound on the value of any state, in scaled rewards: all that an episode may bring."""
     arena, gamma = config.arena, config.agent.gamma
     steps = min(arena.max_frames, 1 / (1 - gamma))
     rewards = (

@@ -1,75 +1,59 @@
-"""Targets and loss of the TD error (paper section 4, Eqs. (2) to (4)): pure functions.
+"""The update on one screen: the loss of a TD error (paper section 4, Eqs. (2) to (4)).
 
-Invariants: a target carries no gradient; a discount of 0 leaves the reward alone, whatever the
-values of the next state are.
+`td_loss` is a pure function of two action-value functions and a batch. Every learner step computes
+it: `PlainStep` with the networks themselves, `accelerate/` with faster ways to evaluate and
+differentiate the same functions.
 
 Shapes: B = transitions, A = actions.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-LossKind = Literal["squared", "huber"]
+from mrcdrl.common.config import AgentConfig
+from mrcdrl.services.learner.batch import Batch
 
-
-def dqn_target(reward: Tensor, discount: Tensor, target_next_q: Tensor) -> Tensor:
-    """y = r + discount max_a Q(s', a; theta-), float32 [B] (Eq. (4)).
-
-    reward, discount: float32 [B]. target_next_q: float32 [B, A], of the target network.
-    """
-    best = target_next_q.max(dim=1).values
-    return (reward + discount * best).detach()
-
-
-def double_dqn_target(
-    reward: Tensor, discount: Tensor, online_next_q: Tensor, target_next_q: Tensor
-) -> Tensor:
-    """y = r + discount Q(s', argmax_a Q(s', a; theta); theta-), float32 [B] (Eq. (2)).
-
-    The online network picks the action, the target network says its value; both float32 [B, A].
-    """
-    picked = online_next_q.argmax(dim=1, keepdim=True)
-    value = target_next_q.gather(1, picked).squeeze(1)
-    return (reward + discount * value).detach()
-
-
-def td_loss(
-    q: Tensor, action: Tensor, target: Tensor, importance_weights: Tensor, kind: LossKind
-) -> tuple[Tensor, Tensor]:
-    """Loss float32 [] and TD errors y - Q(s, a), float32 [B], without gradient.
-
-    q: float32 [B, A]; action: int64 [B]; target, importance_weights: float32 [B]. `squared` is
-    Eq. (3), the mean of the squares; `huber` is half the square up to an error of 1, then linear.
-    """
-    taken = q.gather(1, action.unsqueeze(1)).squeeze(1)
-    if kind == "squared":
-        losses = functional.mse_loss(taken, target, reduction="none")
-    else:
-        losses = functional.huber_loss(taken, target, reduction="none")
-    return torch.mean(importance_weights * losses), target - taken.detach()
+S = TypeVar("S")  # states, in the form that the action-value functions take
 
 
 @dataclass(frozen=True, slots=True)
-class Update:
-    """What one step tells; tensors stay on the device until someone reads them."""
+class TDLoss:
+    """The loss of a batch, and what is known of it besides."""
 
-    loss: Tensor  # float32 []
-    mean_q: Tensor  # float32 [], mean over the batch of max_a Q(s, a)
-    gradient_norm: Tensor  # float32 [], before clipping
-    td_errors: Tensor  # float32 [B], target - Q(s, a), rewards scaled
+    loss: Tensor  # float32 [], with gradient
+    td_errors: Tensor  # float32 [B], y - Q(s, a), rewards scaled
+    greedy_q: Tensor  # float32 [B], max_a Q(s, a)
 
-    def numbers(self) -> Tensor:
-        """All of it in one tensor, float32 [3 + B]."""
-        return torch.cat(
-            [torch.stack([self.loss, self.mean_q, self.gradient_norm]), self.td_errors]
-        )
 
-    @classmethod
-    def of_numbers(cls, numbers: Tensor) -> Self:
-        """The update of what `numbers` gave."""
-        loss, mean_q, gradient_norm = numbers[:3].unbind()
-        return cls(loss, mean_q, gradient_norm, numbers[3:])
+def td_loss(
+    online: Callable[[S], Tensor],
+    target: Callable[[S], Tensor],
+    batch: Batch[S],
+    agent: AgentConfig,
+) -> TDLoss:
+    """Loss and TD errors of a batch; online, target: states to values float32 [B, A].
+
+    A discount of 0 leaves the reward alone, whatever the values of the next state are. Only the
+    values of the actions taken have a gradient.
+    """
+    with torch.no_grad():
+        next_q = target(batch.next_observation)
+        # dqn, Eq. (4): the target network picks the action whose value it gives. ddqn and duel,
+        # Eq. (2): the online network picks it.
+        chooses = next_q if agent.kind == "dqn" else online(batch.next_observation)
+        next_value = next_q.gather(1, chooses.argmax(dim=1, keepdim=True)).squeeze(1)
+        y = agent.reward_scale * batch.reward + batch.discount * next_value
+    q = online(batch.observation)
+    taken = q.gather(1, batch.action.unsqueeze(1)).squeeze(1)
+    if agent.loss == "squared":  # Eq. (3)
+        losses = functional.mse_loss(taken, y, reduction="none")
+    else:  # half the square up to an error of 1, then linear
+        losses = functional.huber_loss(taken, y, reduction="none")
+    loss = torch.mean(batch.importance_weights * losses)
+    q = q.detach()
+    return TDLoss(loss, td_errors=y - taken.detach(), greedy_q=q.max(dim=1).values)

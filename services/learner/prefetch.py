@@ -1,6 +1,6 @@
-"""Mini-batches fetched and decoded by a thread of its own while the learner computes.
+"""Mini-batches, fetched and decoded by their own thread while the learner computes.
 
-Invariant: at most `depth` decoded batches wait; when they do, no further one is asked for.
+Invariant: at most `depth` decoded batches wait; when they do, no further one is requested.
 """
 
 import logging
@@ -8,11 +8,17 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor
 
+from mrcdrl.common.arena import layout_symmetries
+from mrcdrl.common.config import Config
 from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.trajectory import Samples
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.learner.accelerate.side_stream import on_side_stream
+from mrcdrl.services.learner.batch import Batch, collate, importance_exponent_at
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.learner.rendering import make_renderer
 from mrcdrl.services.replay.client import ReplayReader
 
 _LOG = logging.getLogger("learner")
@@ -41,16 +47,16 @@ class Prefetcher:
 
     @property
     def ready(self) -> int:
-        """Batches that wait."""
+        """Number of batches that wait."""
         return self._ready.qsize()
 
     @property
     def heard_s(self) -> float:
-        """When replay last answered, on the monotonic clock."""
+        """Monotonic time of replay's last answer."""
         return self._reader.heard_s
 
     def next(self, timeout_s: float, most: int = 1) -> list[Batch]:
-        """The next batches, `most` or as many as are ready; none where none is within the time.
+        """The next batches: `most` or as many as are ready; [] where none is ready in time.
 
         Raises the error that ended the fetching.
         """
@@ -78,7 +84,7 @@ class Prefetcher:
                 batch = self._collate(samples)
             except WireError as error:
                 self.refused += 1
-                _LOG.warning("a mini-batch refused: %s", error)
+                _LOG.warning("mini-batch refused: %s", error)
                 continue
             except Exception as error:  # noqa: BLE001  raised again by next, in the owner's thread
                 self._error = error
@@ -93,3 +99,23 @@ class Prefetcher:
             except queue.Full:
                 continue
             return
+
+
+def make_collate(
+    config: Config, learner: Learner, rendering_threads: Executor | None = None
+) -> Callable[[Samples], Batch]:
+    """A function from samples to the batch of one step, its images rendered by these threads."""
+    symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
+    render = make_renderer(config.arena, learner.device, rendering_threads)
+
+    def collated(samples: Samples) -> Batch:
+        return collate(
+            samples,
+            render,
+            config.arena.stack,
+            symmetries=symmetries,
+            rng=learner.rng,
+            beta=importance_exponent_at(config.replay, learner.learner_step),
+        )
+
+    return on_side_stream(collated, learner.device)

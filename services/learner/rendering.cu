@@ -1,8 +1,8 @@
-// The analytic renderer of common/arena/images/views.py for a GPU: a block draws a image, a thread pixels of it.
+// The analytic renderer of common/arena/images/views.py for a GPU: a block renders an image, a thread pixels of it.
 //
 // It repeats the host's scan lines and order of painting, places in float64 and shares of pixels in float32:
 // a pixel is a grey level off at most. Whoever compiles it defines the configuration (services/learner/
-// drawing.py); px are the arena's, all else is in pixels of the image. Records of any bytes give some image.
+// rendering.py); px are the arena's, all else is in pixels of the image. Records of any bytes give some image.
 // A host's compiler takes it too, for the tests.
 
 #ifdef __CUDACC__
@@ -164,7 +164,7 @@ FUNCTION unsigned char turned_pixel_of(const Shape* shapes, int symmetry, int ro
 #ifdef __CUDACC__
 
 // scenes [B, W, RECORD], symmetries [B], images [B, W, VIEW, VIEW]; a block for each of B x W.
-extern "C" __global__ void draw(const float* scenes, const unsigned char* symmetries, unsigned char* images,
+extern "C" __global__ void render(const float* scenes, const unsigned char* symmetries, unsigned char* images,
                                 int width) {
   __shared__ Shape shapes[NUM_SHAPES];
   const size_t image = blockIdx.x;
@@ -177,7 +177,7 @@ extern "C" __global__ void draw(const float* scenes, const unsigned char* symmet
 
 #else
 
-extern "C" void draw(const float* scenes, const unsigned char* symmetries, unsigned char* images, int width,
+extern "C" void render(const float* scenes, const unsigned char* symmetries, unsigned char* images, int width,
                      int num) {
   for (long image = 0; image < num; image++) {
     Shape shapes[NUM_SHAPES];

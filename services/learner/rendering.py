@@ -1,8 +1,8 @@
-"""From records to the images that a learner step reads, drawn on the host or on its device.
+"""From records to the images that a learner step reads, rendered on the host or on its device.
 
-Invariants: both give the same images within one grey level; a row's images undergo the
-symmetry drawn for it. What a GPU draws is defined by common.arena.views, whose scan lines and
-order of painting `drawing.cu` repeats. Records of any bytes give some image.
+Invariants: both give the same images within one level of intensity; a row's images undergo the
+symmetry drawn for it. common.arena.images.views defines what a GPU renders: `rendering.cu` repeats
+its scan lines and its order of painting. Records of any bytes give some image.
 
 Shapes: B = rows, W = records of a row, R = bytes of a record, V = width of an image in px.
 """
@@ -40,15 +40,15 @@ _LOG = logging.getLogger("learner")
 SymmetryRows = Sequence[tuple[Symmetry, Int64Array]]
 """Symmetries, each with the rows of the batch it was drawn for."""
 
-_BLOCK_IMAGES = 256  # that a thread draws at a time, some 0.5 ms; so few are not worth a second
-_THREADS = 256  # of the device that draw an image
+_BLOCK_IMAGES = 256  # rendered by one thread at a time in some 0.5 ms; fewer need no second one
+_THREADS = 256  # of the device, for one image
 
 
 class Renderer(Protocol):
     """How a learner gets its images."""
 
     def __call__(self, records: UInt8Array, symmetry_rows: SymmetryRows, /) -> Tensor:
-        """uint8 [B, W, V, V] on the learner's device, of records [B, W, R]."""
+        """Images uint8 [B, W, V, V] on the learner's device, of records [B, W, R]."""
         ...
 
 
@@ -99,7 +99,7 @@ of its symmetry in SYMMETRIES, uint8 [B]."""
 
 
 class DeviceRenderer:
-    """Sends the scenes' records to the device, a fraction of the bytes, and draws there."""
+    """Sends the scenes' records to the device, a fraction of the bytes, and renders there."""
 
     def __init__(
         self, config: ArenaConfig, device: torch.device | str, paint: Paint | None = None
@@ -128,9 +128,9 @@ class DeviceRenderer:
 
 
 def _device_paint(config: ArenaConfig, device: torch.device) -> Paint:
-    """By the kernel of drawing.cu, compiled for this configuration."""
+    """The kernel of rendering.cu, compiled for this configuration."""
     macros = definitions(config)
-    kernel = compile_kernel(renderer_source(), "draw", device, macros, threads=_THREADS)
+    kernel = compile_kernel(renderer_source(), "render", device, macros, threads=_THREADS)
 
     def paint(scenes: Tensor, symmetries: Tensor, images: Tensor) -> None:
         rows, width = scenes.shape[:2]
@@ -140,12 +140,12 @@ def _device_paint(config: ArenaConfig, device: torch.device) -> Paint:
 
 
 def renderer_source() -> str:
-    """CUDA C++ with the function `draw`; C++ as well."""
+    """CUDA C++ with the function `render`; also valid C++."""
     return source_of("mrcdrl.services.learner", "rendering.cu")
 
 
 def definitions(config: ArenaConfig) -> dict[str, object]:
-    """The macros that drawing.cu wants of a configuration."""
+    """The macros that rendering.cu takes from a configuration."""
     scale, walls = config.view_px / config.crop_px, inner_walls(config)
     return {
         "VIEW": config.view_px,
@@ -176,23 +176,23 @@ def definitions(config: ArenaConfig) -> dict[str, object]:
 
 
 def _braces(items: Iterable[object]) -> str:
-    """The items as C initialises an array."""
+    """The items as C initializes an array."""
     return "{" + ",".join(str(x) for x in items) + "}"
 
 
 def make_renderer(
     config: ArenaConfig, device: torch.device, threads: Executor | None = None
 ) -> Renderer:
-    """On the device where it is a GPU and draws all that records hold; else on the host.
+    """A renderer on the device where it is a GPU that can render the records; else on the host.
 
-    threads: that draw on the host; the caller's own if None.
+    threads: render on the host; None: the caller's thread does.
     """
     scenes = config.codec == "scene" and config.renders_analytically and not config.pixel_noise
     if device.type == "cuda" and scenes:
         try:
             return DeviceRenderer(config, device)
         except KernelError as error:
-            _LOG.warning("images are drawn on the CPU: %s", error)
+            _LOG.warning("images are rendered on the CPU: %s", error)
     codec = make_codec(config)
     if threads is None:
         return HostRenderer(codec.decode, device)

@@ -1,7 +1,7 @@
-"""Weights versions and checkpoints: what must not go back, and what must survive.
+"""Publishes numbered weights and saves checkpoints: versions never go back.
 
 Invariant: a checkpoint's `weights_version` is at least as large as any version published before
-the next checkpoint, so that a learner killed at any moment goes on with a larger one.
+the next checkpoint, so that a learner killed at any moment continues with a larger one.
 """
 
 import hashlib
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mrcdrl.common.config import Config, to_toml
 from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.learner import Learner
 
@@ -18,15 +19,19 @@ _LOG = logging.getLogger("learner")
 _RESERVED_VERSIONS = 10_000
 
 
-class Keeper:
-    """Numbers the weights and saves the learner; starts from the newest checkpoint there is.
+class WeightsPublisher:
+    """Numbers and publishes a learner's weights; starts from the newest checkpoint there is.
 
     Raises CheckpointError where checkpoints exist and none is whole or fits the agent.
     """
 
-    def __init__(self, config: Config, learner: Learner, directory: Path) -> None:
+    def __init__(
+        self, config: Config, learner: Learner, writer: WeightsWriter, directory: Path
+    ) -> None:
+        """directory: where checkpoints are kept."""
         self._settings = config.learner
         self._learner = learner
+        self._writer = writer
         self._directory = directory
         self._digest = hashlib.sha256(to_toml(config).encode()).hexdigest()
         self.epoch, self.version = time.time_ns(), 0
@@ -43,16 +48,19 @@ class Keeper:
         self._learner.restore(found.checkpoint.state)
         self.epoch = found.checkpoint.weights_epoch
         self.version = found.checkpoint.weights_version
-        _LOG.info("going on from %s", found.path)
+        _LOG.info("continuing from %s", found.path)
 
-    def next_weights(self) -> Weights:
-        """The present parameters under the next version."""
+    def publish(self) -> None:
+        """Publish the present parameters under the next version; returns at once.
+
+        Raises DivergedError, and publishes nothing, where one of them is not finite.
+        """
         if self.version >= self._reserved:
             self.save()
         self.version += 1
-        return Weights.of(
-            self.epoch, self.version, self._learner.learner_step, self._learner.payload()
-        )
+        learner = self._learner
+        weights = Weights.of(self.epoch, self.version, learner.learner_step, learner.payload())
+        self._writer.publish(weights)
 
     def maybe_save(self) -> None:
         """Save if the checkpoint period has passed."""
@@ -61,7 +69,7 @@ class Keeper:
 
     def save(self) -> None:
         """Write a checkpoint now; raises CheckpointError where that fails."""
-        reserved = self.version + _RESERVED_VERSIONS  # rises from save to save: it tells the newest
+        reserved = self.version + _RESERVED_VERSIONS  # rises with every save: tells the newest
         checkpoint.save(
             self._directory,
             checkpoint.Checkpoint(

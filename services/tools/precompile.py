@@ -10,6 +10,7 @@ import torch
 
 from mrcdrl.common.arena import make_arenas, make_codec
 from mrcdrl.common.config import Config
+from mrcdrl.common.model.fast_forward import fast_forward, operands, prepare
 from mrcdrl.common.model.q_network import QNetwork
 
 
@@ -26,7 +27,7 @@ def main() -> None:
     network = QNetwork(config.agent.kind, stack=arena.stack, view_px=arena.view_px)
     windows = torch.zeros(2, arena.stack + 1, arena.view_px, arena.view_px, dtype=torch.uint8)
     for states in (windows[:, : arena.stack].contiguous(), windows[:, : arena.stack]):
-        values = network.evaluate(network.prepare(states), network.operands())
+        values = fast_forward(network, prepare(network, states), operands(network))
         values.sum().backward()  # type: ignore[no-untyped-call]
 
 

@@ -1,60 +1,61 @@
-"""Updates on a GPU, recorded once and replayed by one launch each time.
+"""Steps captured once as a CUDA graph, and replayed by one launch each time.
 
-Without it a GPU waits for Python, which names every operation of every update anew.
+Without graphs a GPU waits for Python, which names every operation of every step anew.
 
-Invariants: what is recorded reads and writes tensors that stay where they are; recording changes
-nothing, replaying is the same as doing the work; the first updates are done as they are, which
-also readies what may not be readied while recording; where recording fails, all go on like that.
+Invariants: what is captured reads and writes tensors that stay where they are; capturing changes
+nothing, replaying is the same as doing the work. The first steps are eager, which also readies
+what may not be readied during a capture. Where capturing fails, all steps stay eager.
 """
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
 
+from mrcdrl.common.errors import ConfigError
 from mrcdrl.services.learner.batch import Batch
-from mrcdrl.services.learner.loss import Update
+from mrcdrl.services.learner.step import Update
 
 _LOG = logging.getLogger("learner")
-_WARM_UP = 3  # calls before the work is recorded, as PyTorch's own examples do
+_WARM_UP = 3  # calls before the work is captured, as PyTorch's own examples do
 
 Work = Callable[[], None]
 
 
-class Recorder(Protocol):
-    """What records a device's work."""
+class Capturer(Protocol):
+    """Captures a device's work, to be replayed."""
 
     def warm_up(self, work: Work, /) -> None:
-        """Do the work as it will be recorded."""
+        """Do the work as it will be captured."""
         ...
 
-    def record(self, work: Work, /) -> Work:
-        """What does the recorded work at each call; raises RuntimeError where it cannot be."""
+    def capture(self, work: Work, /) -> Work:
+        """A function that replays the work; raises RuntimeError where it cannot be captured."""
         ...
 
     def launched(self) -> None:
-        """A call's work was handed to the device; returns once that of the call before is done."""
+        """A call's work was handed to the device; return once that of the call before is done."""
         ...
 
 
 class CudaGraphs:
-    """Records CUDA graphs."""
+    """Captures CUDA graphs."""
 
     def __init__(self) -> None:
         self._launched: torch.cuda.Event | None = None
 
     def warm_up(self, work: Work) -> None:
-        """On a stream beside the usual one, as recordings are made."""
-        usual, beside = torch.cuda.current_stream(), torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        beside.wait_stream(usual)
-        with torch.cuda.stream(beside):
+        """Work on a side stream, where graphs are captured."""
+        usual, side = torch.cuda.current_stream(), torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        side.wait_stream(usual)
+        with torch.cuda.stream(side):
             work()
-        usual.wait_stream(beside)
+        usual.wait_stream(side)
 
-    def record(self, work: Work) -> Work:
-        """Other threads may use the device meanwhile."""
+    def capture(self, work: Work) -> Work:
+        """Capture the work; other threads may use the device meanwhile."""
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             work()
@@ -62,26 +63,42 @@ class CudaGraphs:
         return replay
 
     def launched(self) -> None:
-        """The device always has one launch ahead, and never more that hold their batches."""
+        """Keep the device one launch ahead, and never more: launches hold their batches."""
         before, self._launched = self._launched, torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
         self._launched.record()
         if before is not None:
             before.synchronize()
 
 
-class Recording:
-    """`num` updates in one launch."""
+def capturer_for(
+    setting: Literal["auto", "eager", "graph"], device: torch.device
+) -> Capturer | None:
+    """CUDA graphs where device and setting have them; None: steps are eager.
+
+    Raises ConfigError where graphs are demanded of a device without them.
+    """
+    if device.type == "cuda":
+        return None if setting == "eager" else CudaGraphs()
+    if setting == "graph":
+        raise ConfigError(
+            f"learner.step 'graph': only a CUDA device replays graphs, not {device}; use auto"
+        )
+    return None
+
+
+class CapturedSteps:
+    """`num` steps in one launch."""
 
     def __init__(
         self,
-        recorder: Recorder,
+        capturer: Capturer,
         update: Callable[[Batch], Update],
         learning_rate: Tensor,
         like: Batch,
         num: int,
     ) -> None:
         """learning_rate: float32 [], which the update reads; like: a batch of their shapes."""
-        self._recorder = recorder
+        self._capturer = capturer
         self._update = update
         self._learning_rate = learning_rate
         self._inputs = [like.map(torch.empty_like) for _ in range(num)]
@@ -90,7 +107,7 @@ class Recording:
         self._known_rates = [0.0] * num
         self._updates = torch.zeros(num, 3 + len(like.keys), device=device)
         self._calls = 0
-        self._work: Work | None = None
+        self._replay: Work | None = None
 
     def __call__(self, batches: Sequence[Batch], rates: Sequence[float]) -> list[Update]:
         """Learn from `num` batches, one after the other, each at its learning rate."""
@@ -101,28 +118,28 @@ class Recording:
             if rate != self._known_rates[i]:
                 self._rates[i] = self._known_rates[i] = rate
         self._run()
-        results = self._updates.clone()  # the next call writes over the recorded ones
-        self._recorder.launched()
-        return [Update.of_numbers(numbers) for numbers in results.unbind()]
+        results = self._updates.clone()  # the next call overwrites the captured ones
+        self._capturer.launched()
+        return [Update.from_numbers(numbers) for numbers in results.unbind()]
 
     def _run(self) -> None:
-        if self._work is None and self._calls == _WARM_UP:
-            self._work = self._recorded()
-        if self._work is None:
-            self._recorder.warm_up(self._all)
+        if self._replay is None and self._calls == _WARM_UP:
+            self._replay = self._captured()
+        if self._replay is None:
+            self._capturer.warm_up(self._all)
         else:
-            self._work()
+            self._replay()
         self._calls += 1
 
-    def _recorded(self) -> Work:
+    def _captured(self) -> Work:
         try:
-            work = self._recorder.record(self._all)
+            replay = self._capturer.capture(self._all)
         except RuntimeError as error:
             first_line = str(error).partition("\n")[0]
-            _LOG.warning("steps go on eagerly: recording a graph failed: %s", first_line)
+            _LOG.warning("steps stay eager: capturing a graph failed: %s", first_line)
             return self._all
         _LOG.info("steps are replayed from a graph, %d a launch", len(self._inputs))
-        return work
+        return replay
 
     def _all(self) -> None:
         for batch, rate, numbers in zip(

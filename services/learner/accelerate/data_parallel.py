@@ -1,8 +1,8 @@
-"""Work cut into slices, each done by a thread of its own: rows of a batch, units, parameters.
+"""Threads that share work: each takes a slice of a batch's rows, of a layer's units, of parameters.
 
-Invariants: results come in the order of the slices; the calling thread takes the first of them;
-threads meet once a map. Inside an operation they would meet at every layer, and each time wait
-for the one that another process keeps from its core.
+Invariants: results come in the order of the slices; the calling thread takes the first slice.
+Threads meet once a `map`. Threads inside an operation would meet at every layer, and wait each
+time for the one whose core another process holds.
 """
 
 from collections.abc import Callable
@@ -15,22 +15,22 @@ import torch
 T = TypeVar("T")
 
 
-class Slices:
-    """Up to `num` slices at once; the calling thread's torch should compute with one thread."""
+class DataParallel:
+    """Works on up to `num_threads` slices at once, each with one thread of torch's."""
 
-    def __init__(self, num: int) -> None:
-        self.num = num
-        self._threads = (
-            ThreadPoolExecutor(num - 1, "slice", partial(torch.set_num_threads, 1))
-            if num > 1
+    def __init__(self, num_threads: int) -> None:
+        self.num_threads = num_threads
+        self._pool = (
+            ThreadPoolExecutor(num_threads - 1, "slice", partial(torch.set_num_threads, 1))
+            if num_threads > 1
             else None
         )
 
     def map(self, work: Callable[[slice], T], size: int) -> list[T]:
-        """What the work gives for each slice of `size` rows; raises what it raises."""
-        num = min(self.num, size)
+        """The results of the work on each slice of `size` rows; raises what the work raises."""
+        num = min(self.num_threads, size)
         first, *others = (slice(i * size // num, (i + 1) * size // num) for i in range(num))
-        if self._threads is None:
+        if self._pool is None:
             return [work(first)]
-        begun = [self._threads.submit(work, other) for other in others]
+        begun = [self._pool.submit(work, other) for other in others]
         return [work(first), *(future.result() for future in begun)]

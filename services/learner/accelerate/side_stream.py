@@ -1,4 +1,4 @@
-"""Batches on their way to the learner's device, beside the step that it computes meanwhile."""
+"""Batches copied to a GPU on a stream beside that of the step, which runs meanwhile."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,23 +9,23 @@ from mrcdrl.common.messages.trajectory import Samples
 from mrcdrl.services.learner.batch import Batch
 
 
-def beside_the_step(
+def on_side_stream(
     collate: Callable[[Samples], Batch], device: torch.device
 ) -> Callable[[Samples], Batch]:
-    """The same collate; on a GPU on a stream of its own, for use by one thread.
+    """The same collate; on a GPU it runs on its own stream, for use by one thread.
 
-    It returns once the batch is there: the thread that prepares batches waits, the step does not.
-    Their few kernels therefore go before those of the step.
+    It returns once the batch has arrived: the thread that prepares batches waits, the step does
+    not. Its few kernels therefore go before those of the step.
     """
     if device.type != "cuda":
         return collate
-    beside: Any = torch.cuda.Stream(device, priority=-1)  # type: ignore[no-untyped-call]
+    side: Any = torch.cuda.Stream(device, priority=-1)  # type: ignore[no-untyped-call]
     usual = torch.cuda.default_stream(device)
 
     def collated(samples: Samples) -> Batch:
-        with torch.cuda.stream(beside):
+        with torch.cuda.stream(side):
             batch = collate(samples)
-        beside.synchronize()
+        side.synchronize()
         for tensor in batch.tensors:
             tensor.record_stream(usual)  # its memory is free once the step has read it
         return batch

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from mrcdrl.common.model.fast_forward import fast_forward, operands
 from mrcdrl.common.model.kernels import tensor_core_conv as first_layer_cuda
 from mrcdrl.common.model.kernels.cuda import KernelError, Launch, machine_code
 from mrcdrl.common.model.kernels.sparse_conv_loops import CHANNELS, KERNEL
@@ -41,15 +42,15 @@ def on_a_cpu(
 ) -> Callable[[Layout], FirstLayer]:
     """The kernels of a layout, compiled for the CPU; in two blocks at most."""
     folder = tmp_path_factory.mktemp("kernels")
-    (folder / "first_layer.cu").write_text(first_layer_source(), "utf-8")
+    (folder / "tensor_core_conv.cu").write_text(first_layer_source(), "utf-8")
 
     @cache
     def compiled(layout: Layout) -> FirstLayer:
         library = folder / f"{layout.stack}-{layout.view_px}.so"
         options = ["-std=c++20", "-O2", "-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]
-        options += ["-shared", "-fPIC", "-pthread", f'-DFIRST_LAYER="{folder}/first_layer.cu"']
+        options += ["-shared", "-fPIC", "-pthread", f'-DFIRST_LAYER="{folder}/tensor_core_conv.cu"']
         macros = [f"-D{name}={value}" for name, value in layout.definitions.items()]
-        source = str(HERE / "first_layer_on_a_cpu.cpp")
+        source = str(HERE / "tensor_core_conv_on_a_cpu.cpp")
         command = [cpp_compiler, *options, *macros, source, "-o", str(library)]
         built = subprocess.run(command, capture_output=True, text=True, check=False)
         assert built.returncode == 0, built.stderr
@@ -118,7 +119,7 @@ def test_a_network_computes_with_them(on_a_cpu: Callable[[Layout], FirstLayer]) 
     states = states_of(layout, 2)
     network = QNetwork("duel", compute_dtype=torch.bfloat16)
     images = images_for(on_a_cpu(layout), states)
-    values = network.evaluate(images, network.operands())
+    values = fast_forward(network, images, operands(network))
     torch.testing.assert_close(values, network(states), rtol=0.02, atol=0.02)
 
 

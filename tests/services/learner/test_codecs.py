@@ -11,8 +11,8 @@ from mrcdrl.common.messages.trajectory import Chunk, Weights
 from mrcdrl.common.model.policy import make_policy
 from mrcdrl.services.actor.actor import make_collector
 from mrcdrl.services.learner.learner import Learner
-from mrcdrl.services.learner.main import make_collate
-from mrcdrl.services.replay.build import build
+from mrcdrl.services.learner.prefetch import make_collate
+from mrcdrl.services.replay.table import Table
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NUM_STEPS = 5
@@ -53,7 +53,7 @@ def learned(codec: str, sampler: str) -> bytes:
     """The parameters after some steps on what was collected."""
     config = config_of(codec, sampler)
     learner = Learner(config.agent, config.learner, stack=4, view_px=config.arena.view_px)
-    table, _ = build(config)
+    table = Table.from_config(config)
     for chunk in collect(config, learner, 400):
         table.insert(chunk)
     collate = make_collate(config, learner)

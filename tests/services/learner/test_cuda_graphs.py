@@ -1,7 +1,7 @@
-"""A recorded step gives the numbers of an eager one, to the bit; here with the CPU's tensors.
+"""A captured step gives the numbers of an eager one, to the bit; here with the CPU's tensors.
 
-What stands for a CUDA graph replays the very function that would be recorded, on the same tensors
-that stay where they are: all but the recording itself is what runs on a GPU.
+A stand-in for CUDA graphs replays the very function that would be captured, on the same tensors
+that stay where they are: all but the capture itself is what runs on a GPU.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ from mrcdrl.common.config import AgentConfig, LearnerConfig, load_config
 from mrcdrl.common.errors import ConfigError, DivergedError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.services.learner.accelerate.cuda_graphs import Recorder, Work
+from mrcdrl.services.learner.accelerate.cuda_graphs import Capturer, Work
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.learner import Learner
-from mrcdrl.services.learner.loss import Update
-from mrcdrl.services.learner.main import run
 from mrcdrl.services.learner.prefetch import Prefetcher
-from mrcdrl.services.learner.weights_publisher import Keeper
+from mrcdrl.services.learner.step import Update
+from mrcdrl.services.learner.training_loop import run
+from mrcdrl.services.learner.weights_publisher import WeightsPublisher
 from tests.services.learner.test_learner import FLOAT32, VIEW_PX, random_batch
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,7 +32,7 @@ STEPS = 14
 
 
 class Replay:
-    """Stands for CUDA graphs: what is recorded is done at each call, and not before."""
+    """Stands for CUDA graphs: captured work is done at each call, and not before."""
 
     def __init__(self) -> None:
         self.warm_ups = self.replays = self.launches = 0
@@ -41,7 +41,7 @@ class Replay:
         self.warm_ups += 1
         work()
 
-    def record(self, work: Work) -> Work:
+    def capture(self, work: Work) -> Work:
         def replay() -> None:
             self.replays += 1
             work()
@@ -53,16 +53,16 @@ class Replay:
 
 
 class NoGraphs(Replay):
-    """A device that records nothing."""
+    """A device that captures nothing."""
 
-    def record(self, work: Work) -> Work:
+    def capture(self, work: Work) -> Work:
         raise RuntimeError("operation not permitted when stream is capturing\nmore of it")
 
 
 def make_learner(
-    agent: AgentConfig, recorder: Recorder | None = None, settings: LearnerConfig = FLOAT32
+    agent: AgentConfig, capturer: Capturer | None = None, settings: LearnerConfig = FLOAT32
 ) -> Learner:
-    return Learner(agent, settings, stack=4, view_px=VIEW_PX, recorder=recorder)
+    return Learner(agent, settings, stack=4, view_px=VIEW_PX, capturer=capturer)
 
 
 def batches(num: int = STEPS) -> list[Batch]:
@@ -93,7 +93,7 @@ def assert_same(one: Update, other: Update) -> None:
     [("duel", "adam"), ("ddqn", "adam"), ("dqn", "adam"), ("duel", "rmsprop")],
 )
 @pytest.mark.parametrize("launch", [1, 3])
-def test_a_recorded_step_is_the_eager_one_bit_for_bit(
+def test_a_captured_step_is_the_eager_one_bit_for_bit(
     kind: Literal["duel", "ddqn", "dqn"], optimizer: Literal["adam", "rmsprop"], launch: int
 ) -> None:
     """Over copies to the target network and a learning rate that falls."""
@@ -106,17 +106,17 @@ def test_a_recorded_step_is_the_eager_one_bit_for_bit(
     )
     replay, given = Replay(), batches()
     settings = FLOAT32.model_copy(update={"updates_per_launch": launch})
-    eager, recorded = make_learner(agent), make_learner(agent, replay, settings)
+    eager, captured = make_learner(agent), make_learner(agent, replay, settings)
     expected = [eager.step(batch) for batch in given]
     found = [
         update
         for at in range(0, STEPS, launch)
-        for update in recorded.steps(given[at : at + launch])
+        for update in captured.steps(given[at : at + launch])
     ]
-    assert len(found) == STEPS == recorded.learner_step
+    assert len(found) == STEPS == captured.learner_step
     for one, other in zip(expected, found, strict=True):
         assert_same(one, other)
-    assert recorded.state() == eager.state()
+    assert captured.state() == eager.state()
     assert replay.replays > 0
     assert replay.launches == replay.warm_ups + replay.replays
 
@@ -166,8 +166,8 @@ def test_no_launch_passes_over_a_publication_or_the_end(
     published: list[Weights] = []
     writer, ready, priorities = MagicMock(), Ready(), MagicMock(dropped=0)
     writer.publish.side_effect = published.append
-    keeper = Keeper(config, learner, tmp_path)
-    run(config, learner, ready, priorities, writer, keeper, MagicMock(), StopSignal())  # type: ignore[arg-type]
+    publisher = WeightsPublisher(config, learner, writer, tmp_path)
+    run(config, learner, ready, priorities, publisher, MagicMock(), StopSignal())  # type: ignore[arg-type]
     assert [weights.learner_step for weights in published] == at
     assert ready.asked == [3, 1, 3, 1, 1]
     assert priorities.put.call_count == 9
@@ -191,22 +191,22 @@ def test_what_an_update_told_stays_after_the_next() -> None:
     assert torch.equal(first.td_errors, kept)
 
 
-def test_a_device_that_cannot_record_goes_on_eagerly_and_says_so_once(
+def test_a_device_that_cannot_capture_stays_eager_and_says_so_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     given = batches(8)
-    eager, recorded = make_learner(AgentConfig()), make_learner(AgentConfig(), NoGraphs())
+    eager, captured = make_learner(AgentConfig()), make_learner(AgentConfig(), NoGraphs())
     with caplog.at_level(logging.INFO, "learner"):
         for batch in given:
-            assert_same(eager.step(batch), recorded.step(batch))
+            assert_same(eager.step(batch), captured.step(batch))
     assert caplog.messages == [
-        "steps go on eagerly: recording a graph failed: "
+        "steps stay eager: capturing a graph failed: "
         "operation not permitted when stream is capturing"
     ]
 
 
-def test_a_recorded_learner_that_is_restored_goes_on_from_there() -> None:
-    """What was recorded before would step the parameters that are no more."""
+def test_a_captured_learner_that_is_restored_goes_on_from_there() -> None:
+    """What was captured before would step parameters that no longer exist."""
     given = batches(10)
     whole, other = make_learner(AgentConfig()), make_learner(AgentConfig(), Replay())
     for batch in given[:5]:
@@ -218,7 +218,7 @@ def test_a_recorded_learner_that_is_restored_goes_on_from_there() -> None:
     assert whole.state() == other.state()
 
 
-def test_recorded_steps_that_diverge_are_not_published() -> None:
+def test_captured_steps_that_diverge_are_not_published() -> None:
     learner, given = make_learner(AgentConfig(), Replay()), batches(5)
     for batch in given:
         learner.step(batch)
@@ -238,35 +238,3 @@ def test_steps_on_a_cpu_are_eager(setting: Literal["auto", "eager"]) -> None:
     learner = make_learner(AgentConfig(), settings=LearnerConfig(step=setting, device="cpu"))
     assert learner.updates_per_launch == 1
     assert "step='eager'" in repr(learner)
-
-
-@pytest.mark.parametrize("threads", [2, 3])
-def test_threads_that_share_a_batch_learn_what_one_does(threads: int) -> None:
-    """Up to the order of a sum; and alike each time."""
-    agent, given = AgentConfig(target_period=3), batches(5)
-
-    def shared() -> Learner:
-        return Learner(agent, FLOAT32, stack=4, view_px=VIEW_PX, threads=threads)
-
-    one, some, again = make_learner(agent), shared(), shared()
-    for batch in given:
-        alone, update = one.step(batch), some.step(batch)
-        assert_same(update, again.step(batch))
-        torch.testing.assert_close(alone.loss, update.loss)
-        torch.testing.assert_close(alone.td_errors, update.td_errors, rtol=1e-3, atol=1e-3)
-        torch.testing.assert_close(alone.gradient_norm, update.gradient_norm, rtol=1e-3, atol=1e-3)
-    assert some.state() == again.state()
-
-
-def test_an_error_in_a_thread_that_shares_a_batch_is_raised() -> None:
-    learner = Learner(AgentConfig(), FLOAT32, stack=4, view_px=VIEW_PX, threads=2)
-    batch = random_batch()
-    action = batch.action.clone()
-    action[-1] = 7  # of the second half
-    with pytest.raises(RuntimeError, match="index"):
-        learner.step(dataclasses.replace(batch, action=action))
-
-
-def test_more_threads_than_transitions_do_no_harm() -> None:
-    learner = Learner(AgentConfig(), FLOAT32, stack=4, view_px=VIEW_PX, threads=4)
-    assert learner.step(random_batch(size=2)).td_errors.shape == (2,)

@@ -11,14 +11,15 @@ import torch
 
 from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.errors import DivergedError
+from mrcdrl.common.messages.metrics import numbers
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.diagnostics import Diagnostics, largest_return
 from mrcdrl.services.learner.learner import Learner
-from mrcdrl.services.learner.main import run
-from mrcdrl.services.learner.weights_publisher import Keeper
+from mrcdrl.services.learner.training_loop import run
+from mrcdrl.services.learner.weights_publisher import WeightsPublisher
 from tests.services.learner.test_learner import random_batch
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,12 +46,12 @@ def test_the_figures_are_those_of_the_batch_and_the_network() -> None:
     found = Diagnostics(config, learner).look(batch, update)
     with torch.no_grad():
         q = learner.online(batch.observation[:64])
-    assert found["q_min"] == pytest.approx(float(q.min()))
-    assert found["q_p50"] == pytest.approx(float(q.quantile(0.5)))
-    assert found["q_max"] == pytest.approx(float(q.max()))
-    assert found["td_error_p90"] == pytest.approx(float(update.td_errors.abs().quantile(0.9)))
-    assert found["loss_finite"] == 1
-    assert 0.0 < found["target_drift"] < 0.1
+    assert found.q_min == pytest.approx(float(q.min()))
+    assert found.q_p50 == pytest.approx(float(q.quantile(0.5)))
+    assert found.q_max == pytest.approx(float(q.max()))
+    assert found.td_error_p90 == pytest.approx(float(update.td_errors.abs().quantile(0.9)))
+    assert found.loss_finite == 1
+    assert 0.0 < found.target_drift < 0.1
 
 
 def test_histograms_are_of_the_looks_since_the_last_ones() -> None:
@@ -62,31 +63,29 @@ def test_histograms_are_of_the_looks_since_the_last_ones() -> None:
     errors = torch.tensor([0.0, 0.2, -0.2, 2.0, -2.0, 2.0, math.nan, 2.0]) * bound
     told = dataclasses.replace(update, td_errors=errors)
     first = diagnostics.look(batch, told)
-    assert [first[f"td_error_bin_{i}"] for i in range(10)] == pytest.approx(
-        [1 / 7, *[0.0] * 6, 2 / 7, 0.0, 4 / 7]
-    )
-    assert [first[f"q_bin_{i}"] for i in (4, 5)] != [0.0, 0.0]
+    assert first.td_error_bin == pytest.approx((1 / 7, *[0.0] * 6, 2 / 7, 0.0, 4 / 7))
+    assert first.q_bin[4:6] != (0.0, 0.0)
     with torch.no_grad():
         learner.online.value.bias.fill_(-1.5 * bound)
     between = [diagnostics.look(batch, update) for _ in range(14)]
-    assert not any("bin" in name for found in between for name in found)
+    assert not any(found.q_bin or found.td_error_bin for found in between)
     then = diagnostics.look(batch, update)
-    assert [then[f"q_bin_{i}"] for i in range(10)] == [1.0, *[0.0] * 9]
-    assert sum(then[f"td_error_bin_{i}"] for i in range(10)) == pytest.approx(1.0)
+    assert then.q_bin == (1.0, *[0.0] * 9)
+    assert sum(then.td_error_bin) == pytest.approx(1.0)
 
 
 def test_dead_units_are_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
     config = config_of()
     learner, batch = learner_of(config), random_batch()
     diagnostics, update = Diagnostics(config, learner), learner.step(batch)
-    before = diagnostics.look(batch, update)["dead_share"]
+    before = diagnostics.look(batch, update).dead_share
     units = 32 + 64 + 64 + 512 + 512
     with torch.no_grad():
         learner.online.value_hidden.bias.fill_(-1e6)
         learner.online.conv3.bias.fill_(-1e6)
         learner.online.advantage_hidden.bias.fill_(-1e6)
     with caplog.at_level(logging.WARNING, "learner"):
-        after = [diagnostics.look(batch, update)["dead_share"] for _ in range(2)]
+        after = [diagnostics.look(batch, update).dead_share for _ in range(2)]
     assert before < 0.5
     assert after[0] == after[1] >= (64 + 512 + 512) / units
     assert len(caplog.messages) == 1
@@ -137,12 +136,12 @@ def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_pat
         learner__checkpoint_period_s="1e-9",
     )
     learner = learner_of(config)
-    keeper = Keeper(config, learner, tmp_path)
     published: list[Weights] = []
     writer, reporter = MagicMock(), MagicMock()
     writer.publish.side_effect = published.append
+    publisher = WeightsPublisher(config, learner, writer, tmp_path)
     told: list[dict[str, float]] = []
-    reporter.now.side_effect = lambda metrics: told.append(metrics())
+    reporter.now.side_effect = lambda metrics: told.append(numbers(metrics()))
     batches = [random_batch(seed=step) for step in range(3)] + [nan_batch()]
     with pytest.raises(DivergedError, match="by step 4"):
         run(
@@ -150,8 +149,7 @@ def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_pat
             learner,
             Prefetched(batches),  # type: ignore[arg-type]
             None,
-            writer,
-            keeper,
+            publisher,
             reporter,
             StopSignal(),
         )
@@ -162,6 +160,7 @@ def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_pat
     assert found is not None
     assert (found.checkpoint.state.learner_step, found.passed_over) == (3, ())
     again = learner_of(config)
-    going_on = Keeper(config, again, tmp_path)
+    before = published[-1]
+    WeightsPublisher(config, again, writer, tmp_path).publish()
     assert again.learner_step == 3
-    assert going_on.next_weights().order > published[-1].order
+    assert published[-1].order > before.order

@@ -8,9 +8,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from mrcdrl.common.config import AgentConfig, LearnerConfig
-from mrcdrl.common.model.q_network import Kind, QNetwork, Trace
-from mrcdrl.services.learner.accelerate.data_parallel import Slices
-from mrcdrl.services.learner.accelerate.optimizer import Descent, gradients, leaves
+from mrcdrl.common.model.fast_forward import Trace, fast_forward, operands, prepare
+from mrcdrl.common.model.q_network import Kind, QNetwork
+from mrcdrl.services.learner.accelerate.data_parallel import DataParallel
+from mrcdrl.services.learner.accelerate.optimizer import SharedOptimizer, gradients, leaves
 from mrcdrl.services.learner.learner import Learner
 from tests.services.learner.test_learner import VIEW_PX, random_batch
 
@@ -39,17 +40,17 @@ def make_network(kind: Kind) -> QNetwork:
         return QNetwork(kind, view_px=VIEW_PX)
 
 
-def descend(network: QNetwork, descent: Descent, slices: Slices) -> Tensor:
+def descend(network: QNetwork, optimizer: SharedOptimizer, threads: DataParallel) -> Tensor:
     """One step on the states, shared; the norm of its gradient."""
     with torch.no_grad():
-        operands = network.operands()
+        parameters = operands(network)
 
     def part(rows: slice) -> object:
-        own, trace = leaves(operands, network), Trace()
-        q = network.evaluate(network.prepare(states()[rows]), own, trace)
+        own, trace = leaves(parameters, network), Trace()
+        q = fast_forward(network, prepare(network, states()[rows]), own, trace)
         return gradients(loss_of(q), own, trace)
 
-    return descent.step(slices.map(part, SIZE))  # type: ignore[arg-type]
+    return optimizer.step(threads.map(part, SIZE))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 5])
@@ -59,9 +60,9 @@ def test_the_gradient_is_that_of_the_whole_batch(kind: Kind, threads: int, limit
     expected = reference(kind)
     length = float(torch.nn.utils.get_total_norm(expected.values()))
     assert length > 1.0, "or nothing would be limited"
-    network, slices = make_network(kind), Slices(threads)
+    network, shared = make_network(kind), DataParallel(threads)
     agent = AgentConfig(kind=kind, max_gradient_norm=limit)
-    norm = descend(network, Descent(network, agent, torch.tensor(0.0), slices), slices)
+    norm = descend(network, SharedOptimizer(network, agent, torch.tensor(0.0), shared), shared)
     assert float(norm) == pytest.approx(length, rel=1e-4)
     scale = min(1.0, limit / length) if limit else 1.0
     for name, parameter in network.named_parameters():

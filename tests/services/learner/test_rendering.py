@@ -1,4 +1,4 @@
-"""Images that a GPU draws are those of the host, symmetries included.
+"""Images that a GPU renders are those of the host, symmetries included.
 
 No GPU needs to be here: its kernel's source is C++ as well, which the machine's compiler takes.
 """
@@ -19,7 +19,7 @@ from mrcdrl.common.arena import SYMMETRIES, Scene, make_codec
 from mrcdrl.common.config import ArenaConfig, load_config
 from mrcdrl.common.messages.trajectory import UInt8Array
 from mrcdrl.common.model.kernels.cuda import KernelError, compile_kernel, machine_code
-from mrcdrl.services.learner import rendering as drawing
+from mrcdrl.services.learner import rendering
 from mrcdrl.services.learner.rendering import (
     DeviceRenderer,
     HostRenderer,
@@ -54,19 +54,19 @@ def compiled(cpp_compiler: str, tmp_path: Path) -> Any:
     """A configuration's kernel for the CPU."""
 
     def compile_for(config: ArenaConfig) -> Paint:
-        source, library = tmp_path / "drawing.cpp", tmp_path / "drawing.so"
+        source, library = tmp_path / "rendering.cpp", tmp_path / "rendering.so"
         source.write_text(renderer_source(), "utf-8")
         macros = [f"-D{name}={value}" for name, value in definitions(config).items()]
         options = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
         command = [cpp_compiler, *options, *macros, str(source), "-o", str(library)]
         built = subprocess.run(command, capture_output=True, text=True, check=False)
         assert built.returncode == 0, built.stderr
-        draw = ctypes.CDLL(str(library)).draw
+        render = ctypes.CDLL(str(library)).render
 
         def paint(scenes: torch.Tensor, symmetries: torch.Tensor, images: torch.Tensor) -> None:
             rows, width = scenes.shape[:2]
             pointers = [ctypes.c_void_p(x.data_ptr()) for x in (scenes, symmetries, images)]
-            draw(*pointers, width, rows * width)
+            render(*pointers, width, rows * width)
 
         return paint
 
@@ -104,7 +104,7 @@ def largest_gap(one: torch.Tensor, other: torch.Tensor) -> int:
 
 
 @pytest.mark.parametrize("settings", CONFIGS)
-def test_the_device_draws_what_the_host_draws(compiled: Any, settings: dict[str, Any]) -> None:
+def test_the_device_renders_what_the_host_renders(compiled: Any, settings: dict[str, Any]) -> None:
     config = arena(**settings)
     given = records(config, 200)
     symmetry_rows = [(symmetry, np.arange(i, 200, 9)) for i, symmetry in enumerate(SYMMETRIES)]
@@ -138,12 +138,12 @@ def test_any_record_gives_some_image(compiled: Any, settings: dict[str, Any]) ->
     assert DeviceRenderer(config, "cpu", compiled(config))(given, ()).shape == (300, 2, 60, 60)
 
 
-def test_records_that_are_packed_read_only_bytes_are_drawn(compiled: Any) -> None:
+def test_records_that_are_packed_read_only_bytes_are_rendered(compiled: Any) -> None:
     config = ArenaConfig()
     aligned = records(config, 3)
     packed = np.frombuffer(b"x" + aligned.tobytes(), np.uint8)[1:].reshape(aligned.shape)
-    draw = DeviceRenderer(config, "cpu", compiled(config))
-    assert torch.equal(draw(packed, ()), draw(aligned, ()))
+    render = DeviceRenderer(config, "cpu", compiled(config))
+    assert torch.equal(render(packed, ()), render(aligned, ()))
 
 
 def never(*_: torch.Tensor) -> None:
@@ -152,15 +152,15 @@ def never(*_: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 2, 52), (1, 40), (1, 1, 2, 40)])
 def test_records_of_another_arena_are_refused(shape: tuple[int, ...]) -> None:
-    draw = DeviceRenderer(arena(num_robots=2), "cpu", never)
+    render = DeviceRenderer(arena(num_robots=2), "cpu", never)
     with pytest.raises(ValueError, match=r"not uint8 \[B, W, 40\]"):
-        draw(np.zeros(shape, np.uint8), ())
+        render(np.zeros(shape, np.uint8), ())
 
 
 def test_no_records_give_no_images() -> None:
     config = ArenaConfig()
-    draw = DeviceRenderer(config, "cpu", never)
-    assert draw(np.zeros((0, 2, config.record_bytes), np.uint8), ()).shape == (0, 2, 60, 60)
+    render = DeviceRenderer(config, "cpu", never)
+    assert render(np.zeros((0, 2, config.record_bytes), np.uint8), ()).shape == (0, 2, 60, 60)
 
 
 @pytest.mark.parametrize(
@@ -177,38 +177,38 @@ def test_no_records_give_no_images() -> None:
         ("cuda", {"arena.pixel_noise": "2.0"}, HostRenderer),
     ],
 )
-def test_a_gpu_draws_scenes_itself(
+def test_a_gpu_renders_scenes_itself(
     monkeypatch: pytest.MonkeyPatch, device: str, overrides: dict[str, str], expected: type
 ) -> None:
-    monkeypatch.setattr(drawing, "_device_paint", lambda *_: never)  # no GPU needs to be here
+    monkeypatch.setattr(rendering, "_device_paint", lambda *_: never)  # no GPU needs to be here
     config = load_config("quick", overrides, {}).arena
     assert type(make_renderer(config, torch.device(device))) is expected
 
 
-def test_where_the_kernel_cannot_be_had_the_host_draws_and_says_so(
+def test_where_the_kernel_cannot_be_had_the_host_renders_and_says_so(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(*_: object) -> Paint:
         raise KernelError("cuda-bindings is missing")
 
-    monkeypatch.setattr(drawing, "_device_paint", refuse)
+    monkeypatch.setattr(rendering, "_device_paint", refuse)
     with caplog.at_level(logging.WARNING, "learner"):
         assert type(make_renderer(ArenaConfig(), torch.device("cuda"))) is HostRenderer
-    assert "images are drawn on the CPU: cuda-bindings is missing" in caplog.text
+    assert "images are rendered on the CPU: cuda-bindings is missing" in caplog.text
 
 
 def test_a_kernel_of_a_device_that_is_no_gpu_is_refused() -> None:
     with pytest.raises(KernelError, match="cpu is no CUDA device"):
-        compile_kernel("", "draw", torch.device("cpu"), {}, threads=1)
+        compile_kernel("", "render", torch.device("cpu"), {}, threads=1)
 
 
 @pytest.mark.parametrize("settings", CONFIGS)
 def test_the_kernel_compiles_for_gpus(settings: dict[str, Any]) -> None:
     """Where PyTorch's build for CUDA is, the compiler is as well, GPU or not."""
     pytest.importorskip("cuda.bindings.nvrtc", reason="only with PyTorch's builds for CUDA")
-    assert machine_code(renderer_source(), "draw", (9, 0), definitions(arena(**settings)))
-    with pytest.raises(KernelError, match=r"draw does not compile: .*expected"):
-        machine_code("extern !", "draw", (9, 0), {})
+    assert machine_code(renderer_source(), "render", (9, 0), definitions(arena(**settings)))
+    with pytest.raises(KernelError, match=r"render does not compile: .*expected"):
+        machine_code("extern !", "render", (9, 0), {})
 
 
 @pytest.fixture
@@ -219,7 +219,7 @@ def threads() -> Iterator[Executor]:
 
 @pytest.mark.parametrize("codec", ["scene", "frames"])
 @pytest.mark.parametrize("num_scenes", [0, 1, 128, 129, 400])
-def test_threads_draw_the_same_images(threads: Executor, codec: str, num_scenes: int) -> None:
+def test_threads_render_the_same_images(threads: Executor, codec: str, num_scenes: int) -> None:
     config = arena(num_robots=2, codec=codec)
     given = records(config, max(num_scenes, 1))[:num_scenes]
     given.flags.writeable = False  # as they come off the wire

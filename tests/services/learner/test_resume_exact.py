@@ -8,6 +8,7 @@ actor, which goes on, only its policy's weights are new.
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from mrcdrl.common.model.policy import make_policy
 from mrcdrl.services.actor.actor import make_collector
 from mrcdrl.services.actor.collector import Collector
 from mrcdrl.services.learner.learner import Learner, LearnerState
-from mrcdrl.services.learner.main import make_collate
-from mrcdrl.services.learner.weights_publisher import Keeper
+from mrcdrl.services.learner.prefetch import make_collate
+from mrcdrl.services.learner.weights_publisher import WeightsPublisher
 from mrcdrl.services.replay.service import ReplayService
 from tests.services.replay.test_snapshot import insert, save, start
 
@@ -59,13 +60,16 @@ class Run:
     def __init__(self, config: Config, folder: Path, collector: Collector | None = None) -> None:
         self._config = config
         self._folder = folder
-        self.learner = Learner(config.agent, config.learner, stack=4, view_px=32)
-        self._keeper = Keeper(config, self.learner, folder / "checkpoints")
+        self.learner = Learner.from_config(config)
+        writer = MagicMock()
+        writer.publish.side_effect = lambda weights: self._collector._policy.adopt(weights)
+        checkpoints = folder / "checkpoints"
+        self._publisher = WeightsPublisher(config, self.learner, writer, checkpoints)
         self._collate = make_collate(config, self.learner)
         self._replay: ReplayService = start(folder / "replay", config)
         self._collector = collector or make_collector(config, "actor-0", make_policy(config))
         if collector is None:
-            self._publish()
+            self._publisher.publish()
 
     def go_on(self, until: int) -> None:
         """To so many learner steps."""
@@ -80,18 +84,15 @@ class Run:
             update = self.learner.step(batch)
             table.update_priorities(batch.keys, update.td_errors.abs().numpy())
             if self.learner.learner_step % PUBLISH_PERIOD == 0:
-                self._publish()
+                self._publisher.publish()
 
     def break_off(self) -> bytes:
         """Leave what a run leaves; the actor, which goes on."""
-        self._keeper.save()
+        self._publisher.save()
         save(self._replay, self._folder / "replay")
         assert self._replay._log is not None
         self._replay._log.close()
         return pickle.dumps(self._collector)
-
-    def _publish(self) -> None:
-        self._collector._policy.adopt(self._keeper.next_weights())
 
 
 @pytest.mark.parametrize("sampler", ["uniform", "prioritized"])

@@ -2,11 +2,13 @@
 
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
 from mrcdrl.common.config import load_config
-from mrcdrl.services.learner.weights_publisher import Keeper
+from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.services.learner.weights_publisher import WeightsPublisher
 from tests.services.learner.test_learner import make_learner
 
 DAY_NS = 86_400 * 10**9
@@ -17,10 +19,14 @@ def test_a_clock_that_jumps_between_two_starts_turns_no_version_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_ns: int
 ) -> None:
     config, learner = load_config("smoke", {}, environ={}), make_learner()
-    before = Keeper(config, learner, tmp_path).next_weights()
+    published: list[Weights] = []
+    writer = MagicMock()
+    writer.publish.side_effect = published.append
+    WeightsPublisher(config, learner, writer, tmp_path).publish()
     now_ns = time.time_ns() + jump_ns
     monkeypatch.setattr(time, "time_ns", lambda: now_ns)
     monkeypatch.setattr(time, "time", lambda: now_ns / 1e9)
-    after = Keeper(config, learner, tmp_path).next_weights()
+    WeightsPublisher(config, learner, writer, tmp_path).publish()
+    before, after = published
     assert after.epoch == before.epoch
     assert after.order > before.order

@@ -1,0 +1,103 @@
+"""The accelerated step is held to the plain one, and gives the same bits every time."""
+
+import dataclasses
+from typing import Literal
+
+import pytest
+import torch
+from torch import Tensor
+
+from mrcdrl.common.config import AgentConfig
+from mrcdrl.common.model.q_network import Kind, QNetwork
+from mrcdrl.services.learner.accelerate.step import AcceleratedStep
+from mrcdrl.services.learner.learner import Learner
+from mrcdrl.services.learner.step import GradientStep, PlainStep
+from tests.services.learner.test_cuda_graphs import assert_same, batches, make_learner
+from tests.services.learner.test_learner import FLOAT32, VIEW_PX, random_batch
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+RATE = 1e-3
+
+
+def networks(kind: Kind) -> tuple[QNetwork, QNetwork]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        pair = QNetwork(kind, view_px=VIEW_PX), QNetwork(kind, view_px=VIEW_PX)
+    return pair[0], pair[1].requires_grad_(requires_grad=False)
+
+
+def moved(step: GradientStep, online: QNetwork) -> list[dict[str, Tensor]]:
+    """What each of a few updates tells, and how far all of them moved the parameters."""
+    before = {name: p.detach().clone() for name, p in online.named_parameters()}
+    told = [dataclasses.asdict(step([batch], [RATE])[0]) for batch in batches(4)]
+    parameters = online.named_parameters()
+    return [*told, {name: p.detach() - before[name] for name, p in parameters}]
+
+
+@pytest.mark.parametrize("kind", ["duel", "ddqn", "dqn"])
+@pytest.mark.parametrize("loss", ["squared", "huber"])
+@pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_it_does_what_the_plain_step_does(
+    kind: Kind,
+    loss: Literal["squared", "huber"],
+    optimizer: Literal["adam", "rmsprop"],
+    threads: int,
+) -> None:
+    """Within 1e-4 of the largest number of each kind: sums are added in another order.
+
+    The optimizers divide by the gradient's size; with this epsilon a rounded zero stays small.
+    """
+    agent = AgentConfig(kind=kind, loss=loss, optimizer=optimizer, optimizer_epsilon=1e-2)
+    online, target = networks(kind)
+    expected = moved(PlainStep(online, target, agent), online)
+    online, target = networks(kind)
+    found = moved(AcceleratedStep(online, target, agent, num_threads=threads), online)
+    for one, other in zip(expected, found, strict=True):
+        for name, due in one.items():
+            bound = 1e-4 * float(due.abs().max()) + 1e-7
+            torch.testing.assert_close(other[name], due, atol=bound, rtol=0.0, msg=name)
+
+
+def test_both_keep_the_same_moments() -> None:
+    agent, batch = AgentConfig(), random_batch()
+    online, target = networks("duel")
+    plain, fast = (step(online, target, agent) for step in (PlainStep, AcceleratedStep))
+    assert plain.moments() == fast.moments() == {}
+    plain([batch], [RATE])
+    moments = {name: x.clone() for name, x in plain.moments().items()}
+    fast.restore(plain.moments())
+    assert fast.moments().keys() == moments.keys()
+    assert all(torch.equal(x, moments[name]) for name, x in fast.moments().items())
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_that_share_a_batch_learn_what_one_does(threads: int) -> None:
+    """Up to the order of a sum; and alike each time."""
+    agent, given = AgentConfig(target_period=3), batches(5)
+
+    def shared() -> Learner:
+        return Learner(agent, FLOAT32, stack=4, view_px=VIEW_PX, threads=threads)
+
+    one, some, again = make_learner(agent), shared(), shared()
+    for batch in given:
+        alone, update = one.step(batch), some.step(batch)
+        assert_same(update, again.step(batch))
+        torch.testing.assert_close(alone.loss, update.loss)
+        torch.testing.assert_close(alone.td_errors, update.td_errors, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(alone.gradient_norm, update.gradient_norm, rtol=1e-3, atol=1e-3)
+    assert some.state() == again.state()
+
+
+def test_an_error_in_a_thread_that_shares_a_batch_is_raised() -> None:
+    learner = Learner(AgentConfig(), FLOAT32, stack=4, view_px=VIEW_PX, threads=2)
+    batch = random_batch()
+    action = batch.action.clone()
+    action[-1] = 7  # of the second half
+    with pytest.raises(RuntimeError, match="index"):
+        learner.step(dataclasses.replace(batch, action=action))
+
+
+def test_more_threads_than_transitions_do_no_harm() -> None:
+    learner = Learner(AgentConfig(), FLOAT32, stack=4, view_px=VIEW_PX, threads=4)
+    assert learner.step(random_batch(size=2)).td_errors.shape == (2,)
