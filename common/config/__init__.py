@@ -1,6 +1,7 @@
-"""The one configuration of a run: its schema, where it is loaded from, and its TOML form."""
+"""The configuration of a run: its schema, its sources, and its TOML form."""
 
 from mrcdrl.common.config.load import (
+    DEFAULT_PRESET,
     ENV_PREFIX,
     EXTENDS,
     apply_overrides,
@@ -27,6 +28,7 @@ from mrcdrl.common.config.schema import (
 from mrcdrl.common.config.toml import to_toml
 
 __all__ = [
+    "DEFAULT_PRESET",
     "ENV_PREFIX",
     "EXTENDS",
     "ActorConfig",

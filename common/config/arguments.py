@@ -1,4 +1,4 @@
-"""Command-line flags made from the configuration's schema; an unknown one gets the nearest name.
+"""Command-line flags from the configuration's schema; an unknown flag gets a suggestion.
 
 Invariants: `--section.field VALUE` exists for every field, with its description; values are
 checked by the schema, not here.
@@ -17,9 +17,9 @@ _DEST = "config:"
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that takes no abbreviations and suggests the nearest flag.
+    """An ArgumentParser that accepts no abbreviations and suggests the nearest flag.
 
-    Flags may stand between the arguments of a list.
+    Flags may stand among positional arguments.
     """
 
     def __init__(self, *args: object, **kwargs: object) -> None:
@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         self.error(f"unknown argument {name}" + (f"; did you mean {near[0]}?" if near else ""))
 
     def error(self, message: str) -> NoReturn:
-        """One line, exit code 2."""
+        """Write one line and exit with code 2."""
         sys.stderr.write(f"mrcdrl: {message} (see {self.prog} --help)\n")
         raise SystemExit(2)
 
@@ -53,9 +53,10 @@ def add_config_flags(
     *,
     only: Sequence[str] = (),
 ) -> None:
-    """A flag for every field of the configuration.
+    """Add a flag for every field of the configuration.
 
-    short: shorter spellings, such as {"arena.num_robots": "--robots"}. only: these sections.
+    short: shorter spellings, such as {"arena.num_robots": "--robots"}. only: sections to add; all
+    if empty.
     """
     shorter = short or {}
     for section, model in sections().items():
@@ -78,7 +79,7 @@ def add_config_flags(
 
 
 def overrides(namespace: argparse.Namespace) -> dict[str, str]:
-    """The configuration flags that were given: "section.field" to text."""
+    """The configuration flags that were given, as "section.field" to text."""
     return {
         key.removeprefix(_DEST): value
         for key, value in vars(namespace).items()

@@ -1,7 +1,7 @@
-"""Where a configuration comes from: a preset or a file, the environment, and flags.
+"""Loading a configuration from a preset or file, the environment, and flags.
 
 Precedence: a flag beats an environment variable, which beats the file, which beats the default.
-Invariant: an unknown name is refused with the nearest known one.
+Invariant: an unknown name is refused, and the nearest known one suggested.
 """
 
 import difflib
@@ -14,16 +14,25 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from mrcdrl.common.config.schema import Config, TransportConfig, sections
 from mrcdrl.common.errors import ConfigError
 
+DEFAULT_PRESET = "quick"  # of commands that get no --config
 ENV_PREFIX = "MRCDRL_"
 EXTENDS = "extends"
+_TYPES = {
+    "int": "must be a whole number",
+    "float": "must be a number",
+    "bool": "must be true or false",
+    "string": "must be text",
+    "tuple": "must be a list",
+}
 
 
 def preset_names() -> list[str]:
-    """Names that `--config` takes besides a path."""
+    """Names that `--config` accepts besides a path."""
     files = resources.files("mrcdrl.configs").iterdir()
     return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
 
@@ -35,7 +44,7 @@ def _unknown(name: str, known: Sequence[str], what: str, where: str) -> ConfigEr
 
 
 def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The table of a preset or file, with what it extends merged below it.
+    """The table of a preset or file, merged over those that it extends.
 
     above: the files that extend this one.
     """
@@ -62,7 +71,9 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
     if base not in preset_names():
         base = str(path.parent / str(base))
     if base in (*above, source):
-        raise ConfigError(f"config {source!r} extends itself, by {', '.join((*above, source))}")
+        raise ConfigError(
+            f"config {source!r} extends itself, through {', '.join((*above, source))}"
+        )
     below = _read_toml(base, (*above, source))
     return below | {name: {**below.get(name, {}), **values} for name, values in table.items()}
 
@@ -83,7 +94,7 @@ def _check_names(table: Mapping[str, Any], where: str) -> None:
 
 
 def _parse_value(text: str) -> Any:
-    """A value from a flag or the environment: TOML if it is, else the plain string."""
+    """Parse a value of a flag or variable: as TOML if it is TOML, else as a plain string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -94,13 +105,13 @@ def _merge_text(table: dict[str, Any], dotted: str, text: str, where: str) -> No
     section, _, name = dotted.partition(".")
     value = {section: {name: _parse_value(text)}} if name else {section: {}}
     if not name:
-        raise ConfigError(f"{where}: {dotted!r} is no setting; write SECTION.FIELD")
+        raise ConfigError(f"{where}: {dotted!r} is not a setting; write SECTION.FIELD")
     _check_names(value, where)
     table[section] = {**table.get(section, {}), **value[section]}
 
 
 def environment_overrides(environ: Mapping[str, str]) -> dict[str, str]:
-    """`MRCDRL_LEARNER__BATCH_SIZE=64` as {"learner.batch_size": "64"}."""
+    """The environment's settings: MRCDRL_LEARNER__SEED=6 as {"learner.seed": "6"}."""
     return {
         key.removeprefix(ENV_PREFIX).lower().replace("__", ".", 1): value
         for key, value in environ.items()
@@ -113,12 +124,12 @@ def load_config(
     overrides: Mapping[str, str] | None = None,
     environ: Mapping[str, str] | None = None,
 ) -> Config:
-    """The resolved configuration.
+    """Load and check the configuration.
 
     source: a preset's name or a TOML file; None: the defaults. overrides: "section.field" to
-    text, as flags give them. environ: the process's environment unless given.
+    text, as flags give them. environ: by default the process's environment.
 
-    Raises ConfigError, one line, naming the setting, what is wrong and what is right.
+    Raises ConfigError with one line that names the setting, the value and what it must be.
     """
     table = {} if source is None else _read_toml(source)
     return apply_overrides(table, overrides or {}, environ)
@@ -127,9 +138,9 @@ def load_config(
 def load_transport(
     overrides: Mapping[str, str], environ: Mapping[str, str] | None = None
 ) -> TransportConfig:
-    """How to reach a run whose other settings are not known yet; arguments as of load_config.
+    """Load only [transport], which a process needs before it knows the run's other settings.
 
-    Raises ConfigError as load_config.
+    Arguments and errors are those of `load_config`.
     """
     table = _overridden({}, overrides, environ)
     with _one_line("transport"):
@@ -139,7 +150,7 @@ def load_transport(
 def _overridden(
     table: dict[str, Any], overrides: Mapping[str, str], environ: Mapping[str, str] | None
 ) -> dict[str, Any]:
-    """The table with the environment's settings, and the flags' above them."""
+    """The table with settings of the environment over it, and flags over those."""
     env = environment_overrides(os.environ if environ is None else environ)
     for dotted, text in env.items():
         _merge_text(table, dotted, text, "environment")
@@ -151,31 +162,55 @@ def _overridden(
 def apply_overrides(
     table: dict[str, Any], overrides: Mapping[str, str], environ: Mapping[str, str] | None = None
 ) -> Config:
-    """The configuration of a table, under the environment's settings and the flags'.
+    """The configuration of a table with settings of the environment over it, and flags over those.
 
-    Arguments and errors as of load_config.
+    Arguments and errors are those of `load_config`.
     """
     return validate_config(_overridden(table, overrides, environ))
 
 
 def validate_config(table: Mapping[str, Any]) -> Config:
-    """A Config from its table; raises ConfigError naming the first setting that is wrong."""
+    """Make a Config from its table; raises ConfigError naming the first setting that is wrong."""
     with _one_line():
         return Config.model_validate(table)
 
 
 @contextmanager
 def _one_line(*above: str) -> Iterator[None]:
-    """A ValidationError as a ConfigError that names the first setting that is wrong.
+    """Turn a ValidationError into a ConfigError that names the first setting that is wrong.
 
-    above: what its name begins with.
+    above: the beginning of the setting's name.
     """
     try:
         yield
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, (*above, *first["loc"]))) or "configuration"
-        message = first["msg"].removeprefix("Value error, ")
+        path = (*above, *first["loc"])
+        where = ".".join(map(str, path)) or "configuration"
         given = first.get("input")
         shown = "" if isinstance(given, (dict, BaseModel)) else f" (given {given!r})"
-        raise ConfigError(f"{where}: {message}{shown}") from None
+        raise ConfigError(f"{where}: {_requirement(path, first)}{shown}") from None
+
+
+def _requirement(path: Sequence[str | int], error: Mapping[str, Any]) -> str:
+    """What the setting must be; pydantic's own words where ours have none."""
+    kind = error["type"].partition("_")[0]
+    if kind in ("greater", "less"):
+        field = sections()[str(path[0])].model_fields[str(path[1])]
+        return f"must be {_limits(field)}"
+    message: str = error["msg"].removeprefix("Value error, ")
+    return _TYPES.get(kind) or message.replace("Input should be", "must be")
+
+
+def _limits(field: FieldInfo) -> str:
+    """The limits of a number in words, such as "between 1 and 10"."""
+    given = {
+        name: f"{getattr(bound, name):g}"
+        for bound in field.metadata
+        for name in ("ge", "gt", "le", "lt")
+        if hasattr(bound, name)
+    }
+    if given.keys() == {"ge", "le"}:
+        return f"between {given['ge']} and {given['le']}"
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+    return " and ".join(f"{words[name]} {bound}" for name, bound in given.items())

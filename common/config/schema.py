@@ -1,9 +1,7 @@
-"""The one configuration: a frozen section for each part, every field with its source.
+"""The configuration's schema: a frozen section for each part, every field with its source.
 
-Precedence: a flag beats an environment variable beats the file beats the default written here.
-The defaults are the paper's where it speaks ("paper"), the game it descends from where that
-settles it ("ancestor"), ours otherwise ("ours"). An unknown name is refused with the nearest
-right one.
+A default is the paper's where the paper gives one ("paper"), that of the game it descends from
+where that settles it ("ancestor"), and ours otherwise ("ours").
 """
 
 from collections.abc import Sequence
@@ -11,7 +9,7 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-_FINEST_PX = 2.5  # of the arena: smaller pixels of an image are drawn literally
+_FINEST_PX = 2.5  # arena px per image px; below, the literal renderer draws
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -19,7 +17,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Section(BaseModel):
-    """A part of the configuration: frozen, and strict about names."""
+    """A section of the configuration: frozen, and strict about names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -31,16 +29,16 @@ class ArenaConfig(Section):
     """`robots`: the paper's arena. `counting`: images that encode actor, episode and step, for
     tests of the data path. (ours)"""
     physics: Literal["array", "pymunk"] = "array"
-    """What moves the robots: compiled arrays, or pymunk, which is the reference; both give the same
-    poses. (ours; ancestor: pymunk)"""
+    """Physics engine: compiled arrays, or pymunk, the reference; both give the same poses.
+    (ours; ancestor: pymunk)"""
     num_robots: Annotated[int, Field(ge=1, le=10)] = 2
     """(paper: 2, 3, 4)"""
     num_targets: Annotated[int, Field(ge=0, le=20)] = 0
-    """Targets, of which every robot needs one; 0: as many as robots. (paper: as many as robots)"""
+    """Targets; every robot needs one; 0: as many as robots. (paper: as many as robots)"""
     size_px: Annotated[int, Field(ge=120)] = 600
     """Width and height of the square arena. (paper)"""
     wall_offset_px: Annotated[float, Field(ge=0)] = 10
-    """From the border to the wall's outer face. (paper)"""
+    """Distance from the border to the wall's outer face. (paper)"""
     wall_thickness_px: Positive = 2
     """(paper)"""
     robot_radius_px: Positive = 25
@@ -48,39 +46,39 @@ class ArenaConfig(Section):
     target_size_px: Positive = 30
     """s_w = s_h, sides of a square target. (paper)"""
     turn_deg: Annotated[float, Field(gt=0, lt=180)] = 23
-    """Turn of a `left` or `right` action. (paper)"""
+    """Angle that a `left` or `right` action turns. (paper)"""
     step_px: Positive = 2.5
-    """Way moved after the turn, by every action. (paper; ancestor: a turn moves on too)"""
+    """Distance that every action moves, after its turn. (paper; ancestor: a turn moves too)"""
     target_layout: Literal["fixed", "random"] = "fixed"
-    """`fixed`: one layout for each number of robots; `random`: anew each episode. (ours: the
+    """`fixed`: one layout for each number of robots; `random`: a new one each episode. (ours: the
     paper calls only the robots' start random)"""
     targets_px: tuple[tuple[float, float], ...] = ()
     """Target centres (x, y) instead of the built-in fixed layout. (ours)"""
     obstacles_px: tuple[tuple[float, float, float], ...] = ()
     """Discs (x, y, radius) that stop robots as walls do. (ours)"""
     num_obstacles: Annotated[int, Field(ge=0, le=20)] = 0
-    """Discs besides, at random places anew each episode; robots can always pass between them.
+    """Further discs at random places, new each episode; robots can always pass between them.
     (ours)"""
     obstacle_radius_px: Positive = 30
-    """Of the random discs. (ours)"""
+    """Radius of the random discs. (ours)"""
     inner_walls_px: tuple[tuple[float, float, float, float], ...] = ()
-    """Walls (x, y, x, y) from one point to another, as thick as the outer ones. (ours)"""
+    """Inner walls (x, y, x, y) between two points, as thick as the outer ones. (ours)"""
     failure_probability: Fraction = 0
-    """Of each robot in each frame: it then stands where it is to the episode's end, and success is
-    that of the others; the last one never fails. (ours)"""
+    """Probability, for each robot and frame, that it fails: it then stands still to the episode's
+    end, and success counts the others; the last one never fails. (ours)"""
     success_radius_px: Positive = 20
-    """delta: every robot this near to a target of its own is success. (paper)"""
+    """delta: success is each robot within this distance of a different target. (paper)"""
     max_collisions: Count = 5
-    """Robot collisions that end a training episode as failed; the test ends at 1. (paper)"""
+    """Robot collisions that end a training episode in failure; the test ends at 1. (paper)"""
     back_off_frames: Annotated[int, Field(ge=0)] = 0
-    """Frames a robot is driven backwards after a collision; 0: its move is undone and it goes on.
+    """Frames that a robot drives backwards after a collision; 0: its move is undone instead.
     (ancestor: 10)"""
     success_reward: float = 200
-    """To each robot. (paper)"""
+    """Reward to each robot. (paper)"""
     collision_reward: float = -5
     """(paper)"""
     step_reward: float = 0.03
-    """Off target, no collision. (paper)"""
+    """Reward off target and without a collision. (paper)"""
     proximity_weight: Fraction = 0.7
     """p in r = r_chi p + r_f (1 - p). (paper, Fig. 5)"""
     f_max: Count = 500
@@ -90,32 +88,33 @@ class ArenaConfig(Section):
     view_px: Annotated[int, Field(ge=31, le=255)] = 60
     """Width and height of a robot's image. (paper)"""
     crop_px: Annotated[float, Field(ge=1)] = 600
-    """w = h of the rectangle cut out around the robot. (ours: not given; 600 shows the half
-    around it)"""
+    """w = h of the square cut out around the robot. (ours: not given; 600 shows the half around
+    it)"""
     orientation: Literal["unrotated", "heading_up"] = "unrotated"
-    """Of the cut-out. (paper names no rotation; heading_up is ours)"""
+    """Orientation of the cut-out. (paper names no rotation; heading_up is ours)"""
     stack: Annotated[int, Field(ge=1, le=16)] = 4
     """Consecutive images that make a state. (paper)"""
     renderer: Literal["analytic", "literal"] = "analytic"
-    """`literal` draws 600x600, greys, crops, pads and area-resizes as the paper does; `analytic`
-    computes the same coverage straight at 60x60, but where an image's pixel is less than 2.5 px of
-    the arena: there single pixels of the drawing show, and it draws as `literal` does. (ours)"""
+    """`literal` draws at 600x600, converts to intensity, crops, pads and area-resizes as the paper
+    does; `analytic` computes the same coverage directly at 60x60, except where an image's pixel is
+    less than 2.5 px of the arena: there single pixels show, and it draws as `literal` does. (ours)
+    """
     pixel_noise: Annotated[float, Field(ge=0)] = 0
-    """Standard deviation of the noise on every pixel of a robot's image, in levels of grey.
+    """Standard deviation of the noise on every pixel of a robot's image, in intensity levels.
     (ours)"""
     dropped_frame_probability: Annotated[float, Field(ge=0, lt=1)] = 0
-    """Of each robot in each frame: it then sees its image before once more. (ours)"""
+    """Probability, for each robot and frame, that it sees its previous image again. (ours)"""
     codec: Literal["scene", "frames"] = "scene"
-    """What an observation record holds: poses from which the image is drawn, or pixels. (ours)"""
+    """Content of a record: poses from which the image is rendered, or its pixels. (ours)"""
 
     @property
     def target_count(self) -> int:
-        """Targets of an episode."""
+        """Number of targets in an episode."""
         return self.num_targets or self.num_robots
 
     @property
     def obstacle_count(self) -> int:
-        """Discs of an episode."""
+        """Number of discs in an episode."""
         return len(self.obstacles_px) + self.num_obstacles
 
     @property
@@ -125,7 +124,7 @@ class ArenaConfig(Section):
 
     @property
     def record_bytes(self) -> int:
-        """Length of one observation record: the pixels, or all that they are drawn from."""
+        """Length of one observation record: pixels, or the scene they are rendered from."""
         if self.codec == "frames":
             return self.view_px * self.view_px
         layout = 2 * self.target_count + 3 * self.obstacle_count
@@ -141,7 +140,7 @@ class ArenaConfig(Section):
         if self.target_count < self.num_robots:
             raise ValueError(
                 f"num_targets {self.num_targets} leaves {self.num_robots} robots without a target "
-                "each; give as many as robots or more, or 0"
+                "each; give at least one a robot, or 0"
             )
         if self.targets_px and len(self.targets_px) != self.target_count:
             raise ValueError(
@@ -159,14 +158,16 @@ class ArenaConfig(Section):
         if any(radius <= 0 for _, _, radius in self.obstacles_px):
             raise ValueError("obstacles_px has a radius that is not above 0")
         if any(wall[:2] == wall[2:] for wall in self.inner_walls_px):
-            raise ValueError("inner_walls_px has a wall without length: give two points")
+            raise ValueError("inner_walls_px has a wall without length: give two different points")
         if self.codec == "scene" and self.kind == "counting":
-            raise ValueError('kind = "counting" encodes its counters in pixels: codec = "frames"')
+            raise ValueError(
+                'kind = "counting" encodes its counters in pixels: set codec = "frames"'
+            )
         return self
 
 
 class AgentConfig(Section):
-    """What is learned (paper sections 4 and 5.2)."""
+    """The network and its update (paper sections 4 and 5.2)."""
 
     kind: Literal["duel", "ddqn", "dqn"] = "duel"
     """`dqn`: target (4). `ddqn`: target (2). `duel`: target (2) and two streams (1). (paper)"""
@@ -175,9 +176,9 @@ class AgentConfig(Section):
     n_step: Annotated[int, Field(ge=1, le=32)] = 1
     """Rewards summed before the bootstrap. (paper: 1; Ape-X: 3)"""
     reward_scale: Positive = 1.0
-    """Rewards are multiplied by this in the learner's target. (ours)"""
+    """Factor on the rewards in the learner's target. (ours)"""
     loss: Literal["squared", "huber"] = "squared"
-    """Of the TD error, Eq. (3). (paper: squared)"""
+    """Loss of the TD error, Eq. (3). (paper: squared)"""
     optimizer: Literal["adam", "rmsprop"] = "adam"
     """(ours; ancestor: rmsprop)"""
     learning_rate: Positive = 1e-4
@@ -188,7 +189,7 @@ class AgentConfig(Section):
     optimizer_epsilon: Positive = 1e-7
     """Added to the root of the second moment; 1.5e-4 all but stops learning here. (ours)"""
     max_gradient_norm: Annotated[float, Field(ge=0)] = 10.0
-    """Clipped above; 0: never. (ours; dueling paper: 10)"""
+    """Gradients are clipped to this norm; 0: never. (ours; dueling paper: 10)"""
     target_period: Count = 2500
     """Learner steps between copies to the target network: t of section 4. (ours; Ape-X: 2500)"""
 
@@ -207,21 +208,21 @@ def _check_schedule(name: str, points: Sequence[tuple[int, float]]) -> None:
 
 
 class ExplorationConfig(Section):
-    """How epsilon of the epsilon-greedy actors runs (paper section 5.2)."""
+    """Epsilon of the epsilon-greedy actors (paper section 5.2)."""
 
     kind: Literal["schedule", "ladder"] = "schedule"
     """`schedule`: epsilon over learner steps, the same in every actor. `ladder`: the schedule,
-    raised to a power 1 ... ladder_power spread over the arenas of all actors. (ours; Ape-X)"""
+    raised to powers from 1 to ladder_power spread over the arenas of all actors. (ours; Ape-X)"""
     schedule: tuple[tuple[int, float], ...] = ((0, 1.0), (800_000, 0.1))
     """Points (learner step, epsilon), linear between, constant after the last. (paper)"""
     ladder_power: Annotated[float, Field(ge=1)] = 3.0
-    """Power of the least exploring arena. (ours; Ape-X: 8 with 360 actors)"""
+    """Power of the arena that explores least. (ours; Ape-X: 8 with 360 actors)"""
     slots: Annotated[int, Field(ge=0)] = 0
-    """Places of the ladder, each leased to one actor; 0: as many as there are actors that hold
-    one. (ours; Ape-X: as many as actors)"""
+    """Exploration slots, the places of the ladder, each leased to one actor; 0: as many as actors
+    hold one. (ours; Ape-X: as many as actors)"""
     lease_s: Annotated[float, Field(ge=1)] = 15.0
-    """An actor that is not heard of for so long loses its slot; it renews three times as often.
-    (ours)"""
+    """Lease of an exploration slot: an actor that stays silent for longer loses it, and renews it
+    three times as often. (ours)"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -232,45 +233,45 @@ class ExplorationConfig(Section):
 
 
 class ReplayConfig(Section):
-    """The table and its rate limiter (paper section 5.2)."""
+    """The replay table and its rate limiter (paper section 5.2)."""
 
     capacity: Count = 400_000
-    """Transitions; the oldest are replaced. (paper)"""
+    """Transitions that the table holds; new ones replace the oldest. (paper)"""
     min_size: Count = 50_000
-    """Transitions before the first sample is given. (paper)"""
+    """Transitions inserted before the first sample. (paper)"""
     capacity_bytes: Annotated[int, Field(ge=0)] = 0
-    """Memory that the table takes at most, all of it at the start; fewer transitions are kept where
-    capacity would need more; 0: no limit. (ours)"""
+    """Limit of the table's memory, allocated at the start; fewer transitions are kept if capacity
+    would need more; 0: no limit. (ours)"""
     shards: Count = 1
     """Replay processes that share capacity and min_size; an actor inserts into one, the learner
     samples from all. (ours)"""
     sampler: Literal["uniform", "prioritized"] = "uniform"
-    """`uniform`: each transition as likely as any other. `prioritized`: in proportion to its last
-    absolute TD error, to the power priority_exponent. (paper; Ape-X: prioritized)"""
+    """`uniform`: each transition is equally likely. `prioritized`: in proportion to its last
+    absolute TD error, raised to priority_exponent. (paper; Ape-X: prioritized)"""
     priority_exponent: Fraction = 0.6
     """alpha of prioritized sampling; 0 is uniform. (Ape-X)"""
     importance_exponent: Fraction = 0.4
-    """beta of the importance weights, which take back what prioritized sampling distorts, in the
-    learner's first step; 1 takes back all of it. (Ape-X)"""
+    """beta of the importance weights at the learner's first step; they correct for prioritized
+    sampling, with 1 fully. (Ape-X)"""
     importance_exponent_final: Fraction = 0.4
     """beta after importance_anneal_steps. (Ape-X; prioritized replay's paper: 1)"""
     importance_anneal_steps: Count = 100_000
-    """Learner steps over which beta goes from the one to the other, linearly. (ours)"""
+    """Learner steps over which beta changes linearly to its final value. (ours)"""
     samples_per_insert: Annotated[float, Field(ge=0)] = 8.0
-    """Transitions sampled for each inserted; both sides are held to it; 0: no limit. (ours)"""
+    """Transitions sampled for each one inserted; both sides keep to it; 0: no limit. (ours)"""
     tolerance: Annotated[float, Field(ge=0)] = 0.1
-    """Share of min_size x samples_per_insert by which either side may run ahead. (ours)"""
+    """Fraction of min_size x samples_per_insert by which either side may run ahead. (ours)"""
     hold_s: Positive = 5.0
-    """A request the limiter holds is answered "held" after this; the client asks again. (ours)"""
+    """Time after which a throttled request is answered "held"; the client asks again. (ours)"""
     fsync: Literal["never", "always", "off"] = "never"
-    """Of the log of accepted chunks: `never` outlives kill -9, `always` a power cut as well, at
-    the disk's pace; `off` keeps no log. (ours)"""
+    """When the log of accepted chunks is synced: with `never` it survives kill -9, with `always` a
+    power cut too, at the disk's pace; `off` keeps no log. (ours)"""
     segment_bytes: Count = 64 << 20
-    """Size at which the log starts a new file; whole files go as the table evicts. (ours)"""
+    """Size at which the log starts a new file; files are deleted as the table evicts. (ours)"""
     snapshot_period_s: Positive = 10.0
-    """Between snapshots of the priorities and counters, which the log does not hold. (ours)"""
+    """Time between snapshots of the priorities and counters, which the log lacks. (ours)"""
     seed: int = 0
-    """Of the sampler. (ours)"""
+    """Seed of the sampler. (ours)"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -283,86 +284,86 @@ class ReplayConfig(Section):
 
     @property
     def shard_capacity(self) -> int:
-        """Transitions of one shard."""
+        """Transitions that one shard holds."""
         return -(-self.capacity // self.shards)
 
     @property
     def shard_min_size(self) -> int:
-        """Transitions of one shard before its first sample."""
+        """Transitions inserted into one shard before its first sample."""
         return -(-self.min_size // self.shards)
 
     @property
     def prioritized(self) -> bool:
-        """Whether TD errors decide what is sampled."""
+        """Whether TD errors decide which transitions are sampled."""
         return self.sampler == "prioritized"
 
 
 class ActorConfig(Section):
-    """Collecting."""
+    """Collecting transitions."""
 
     num_arenas: Count = 8
-    """Arenas stepped together, one batched inference for all their robots. (ours)"""
+    """Arenas stepped together, with one batched inference for all their robots. (ours)"""
     chunk_length: Annotated[int, Field(ge=1, le=1024)] = 50
-    """Transitions a chunk. (Ape-X)"""
+    """Transitions in a chunk. (Ape-X)"""
     spool_chunks: Count = 8
-    """Chunks waiting to be acknowledged before the arenas stop: nothing is dropped. (ours)"""
+    """Unacknowledged chunks at which the arenas stop; nothing is dropped. (ours)"""
     warn_s: Positive = 10.0
-    """Without an acknowledgement for so long, the actor says whom it waits for. (ours)"""
+    """Time without an acknowledgement after which the actor logs whom it waits for. (ours)"""
     device: str = "cpu"
-    """That chooses the actions; `auto`: cuda if there is one, else cpu. (ours)"""
+    """Device of the policy; `auto`: cuda if available, else cpu. (ours)"""
     threads: Count = 1
     """Torch threads. (ours)"""
 
 
 class LearnerConfig(Section):
-    """Learning."""
+    """Learning from samples."""
 
     batch_size: Count = 32
     """(paper)"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Of convolutions and hidden layers; heads and loss are float32 always. `auto`: bfloat16
-    where the processor computes in it. (ours)"""
+    """Precision of convolutions and hidden layers; heads and loss are always float32. `auto`:
+    bfloat16 where the processor supports it. (ours)"""
     device: str = "auto"
-    """`auto`: cuda if there is one, else cpu. (ours)"""
+    """`auto`: cuda if available, else cpu. (ours)"""
     step: Literal["auto", "eager", "graph"] = "auto"
-    """`eager`: operation after operation. `graph`: recorded once as a CUDA graph, then replayed.
+    """`eager`: one operation after another. `graph`: captured once as a CUDA graph, then replayed.
     `auto`: graph on a GPU where that works, eager elsewhere; the log says which. (ours)"""
     updates_per_launch: Count = 4
-    """Updates that one launch of a graph makes where so many batches are ready and none of
-    target_period, publish_period and run.learner_steps falls between them. (ours)"""
+    """Updates in one launch of a graph, if as many batches are ready and none of target_period,
+    publish_period and run.learner_steps falls between them. (ours)"""
     threads: Annotated[int, Field(ge=0)] = 0
     """Threads that share a batch on a CPU; 0: half the cores, at least 1. (ours)"""
     drawing_threads: Annotated[int, Field(ge=0)] = 0
-    """Threads that share the drawing of a large batch where the CPU draws; 0: one a core. (ours)"""
+    """Threads that render a large batch, where the CPU renders; 0: one a core. (ours)"""
     prefetch_batches: Count = 8
     """Batches decoded ahead of the step. (ours)"""
     requests_in_flight: Count = 4
-    """Sample requests sent ahead. (ours)"""
+    """Sample requests in flight. (ours)"""
     batches_per_request: Annotated[int, Field(ge=0)] = 0
-    """Mini-batches sampled by one request; 0: as many as fit 128 transitions, or 1. (ours)"""
+    """Mini-batches in one sample request; 0: as many as fit 128 transitions, or 1. (ours)"""
     symmetries: bool = False
-    """Turn and mirror each sampled transition by a random symmetry of the target layout, its
-    action with it. (ours)"""
+    """Apply a random symmetry of the target layout (rotation, mirror image) to each sampled
+    transition, its action included. (ours)"""
     publish_period: Count = 100
     """Learner steps between publications of the weights. (ours)"""
     publish_interval_s: Annotated[float, Field(ge=0)] = 0.2
-    """Seconds between publications at least: a learner that takes so many steps a second passes
-    over some, and leaves time to those who adopt them. Not with run.turn_size. (ours)"""
+    """Least time between publications: a fast learner skips some, which leaves their readers time
+    to adopt them. Not with run.turn_size. (ours)"""
     publish_precision: Literal["float32", "bfloat16", "float16"] = "float32"
-    """Of published weights; half of it halves their bytes, and those who adopt them cast up. The
-    best weights are kept as they were judged. (ours)"""
+    """Precision of published weights: half precision halves their bytes, and readers cast up. The
+    best weights are kept as evaluated. (ours)"""
     checkpoint_period_s: Positive = 60.0
-    """(ours)"""
+    """Time between checkpoints. (ours)"""
     keep_checkpoints: Count = 3
-    """Newest kept; the evaluator keeps the best beside them. (ours)"""
+    """Newest checkpoints kept; the evaluator keeps the best weights beside them. (ours)"""
     warn_s: Positive = 10.0
-    """Without a batch for so long, the learner says whom it waits for. (ours)"""
+    """Time without a batch after which the learner logs whom it waits for. (ours)"""
     seed: int = 0
-    """Of the initial parameters and the symmetries drawn. (ours)"""
+    """Seed of the initial parameters and the random symmetries. (ours)"""
 
     @property
     def sample_size(self) -> int:
-        """Transitions of one sample request: whole mini-batches."""
+        """Transitions in one sample request: whole mini-batches."""
         return self.batch_size * (self.batches_per_request or max(1, 128 // self.batch_size))
 
 
@@ -370,15 +371,15 @@ class EvaluatorConfig(Section):
     """The paper's test (section 5.3), run on live weights."""
 
     episodes: Count = 100
-    """Starts judged each time; the paper's table has 1100. (ours)"""
+    """Episodes of each evaluation; the paper's table has 1100. (ours)"""
     epsilon: Fraction = 0.01
     """(paper)"""
     period_s: Annotated[float, Field(ge=0)] = 30.0
-    """From the start of one evaluation to the next at the earliest. (ours)"""
+    """Least time between the starts of two evaluations. (ours)"""
     max_share: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the time spent judging at most: a wandering policy takes long to judge. (ours)"""
+    """Greatest fraction of time spent evaluating: a wandering policy takes long. (ours)"""
     seed: int = 1
-    """Of the start states: the same for every version. (ours)"""
+    """Seed of the start states, which are the same for every version. (ours)"""
     threads: Count = 1
     """Torch threads. (ours)"""
 
@@ -387,54 +388,55 @@ class RunConfig(Section):
     """One run of `mrcdrl train`."""
 
     actors: Annotated[int, Field(ge=0)] = 0
-    """Actor processes; 0: from the cores. (ours)"""
+    """Actor processes; 0: derived from the number of cores. (ours)"""
     evaluators: Annotated[int, Field(ge=0)] = 1
     """Evaluator processes. (ours)"""
     seed: int = 0
-    """Of the arenas. (ours)"""
+    """Seed of the arenas. (ours)"""
     turn_size: Annotated[int, Field(ge=0)] = 0
-    """Transitions that the one actor collects before the learner takes its turn; the same seeds
-    then give the same numbers, over restarts too. 0: both at once. (ours)"""
+    """Lockstep: transitions that the one actor collects before the learner takes its turn; the same
+    seeds then give the same numbers, even across restarts. 0: both run freely. (ours)"""
     minutes: Annotated[float, Field(ge=0)] = 0
-    """Ends the run after so long; 0: never. (ours)"""
+    """Ends the run after this time; 0: never. (ours)"""
     learner_steps: Annotated[int, Field(ge=0)] = 0
-    """Ends the run at this many; 0: never. (ours)"""
+    """Ends the run at this learner step; 0: never. (ours)"""
     target_success_rate: Fraction = 0
-    """Ends the run at the first evaluation that reaches this; 0: never. (ours)"""
+    """Ends the run at the first evaluation that reaches this rate; 0: never. (ours)"""
     patience_episodes: Annotated[int, Field(ge=0)] = 1000
-    """The paper's stopping rule (section 5.2): ends the run when the successes of 100 episodes
-    reached no new maximum in so many episodes; 0: never. (paper)"""
+    """The paper's stopping rule (section 5.2): ends the run when the successes in 100 episodes
+    reach no new maximum for this many episodes; 0: never. (paper)"""
     patience_floor: Fraction = 0.5
-    """The rule acts only after this share of 100 episodes succeeded: before learning takes
-    hold there is no maximum to wait for. ("when a certain size is satisfied"; value ours)"""
+    """The stopping rule acts only once this fraction of 100 episodes succeeded: before learning
+    takes hold there is no maximum to wait for. ("when a certain size is satisfied"; value ours)
+    """
 
 
 class TransportConfig(Section):
-    """Zenoh."""
+    """Connections over Zenoh."""
 
     connect: tuple[str, ...] = ()
     """Endpoints to connect to, such as tcp/127.0.0.1:7447. (ours)"""
     listen: tuple[str, ...] = ()
-    """Endpoints to listen on; the replay process of one machine. (ours)"""
+    """Endpoints to listen on, for the replay process or a router. (ours)"""
     ca: str = ""
-    """The certificate of the authority that the others' certificates are of, a PEM file. With it,
-    certificate and key, endpoints are tls/HOST:PORT and everyone shows a certificate. (ours)"""
+    """Certificate of the authority that signs all certificates, a PEM file. With ca, certificate
+    and key, endpoints are tls/HOST:PORT and every process shows a certificate. (ours)"""
     certificate: str = ""
-    """This process's own, a PEM file; its common name is the role it may play. (ours)"""
+    """This process's certificate, a PEM file; its common name is the role it may play. (ours)"""
     key: str = ""
-    """The private key of the certificate, a PEM file. (ours)"""
+    """Private key of the certificate, a PEM file. (ours)"""
     timeout_s: Positive = 10.0
     """Deadline of one query. (ours)"""
     max_message_bytes: Count = 64 << 20
-    """Larger messages are refused. (ours)"""
+    """Largest message; larger ones are refused. (ours)"""
     shared_memory: bool = True
-    """Large messages between processes of one host go through memory that they share, where both
-    can reach it; over the network otherwise. (ours)"""
+    """Send large messages between processes of one host through shared memory, where both can
+    reach it; over the network otherwise. (ours)"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if len({bool(self.ca), bool(self.certificate), bool(self.key)}) > 1:
-            raise ValueError("ca, certificate and key are given together or not at all")
+            raise ValueError("give ca, certificate and key together, or none of them")
         return self
 
 
@@ -456,7 +458,7 @@ class Config(Section):
         if self.replay.hold_s >= self.transport.timeout_s:
             raise ValueError(
                 f"replay.hold_s {self.replay.hold_s:g} is not below transport.timeout_s "
-                f"{self.transport.timeout_s:g}: a request held would look like one unanswered"
+                f"{self.transport.timeout_s:g}: a throttled request would look unanswered"
             )
         smallest = self.learner.batch_size
         if self.replay.shard_min_size < smallest:
@@ -470,21 +472,21 @@ class Config(Section):
         return self
 
     def _check_lockstep(self) -> None:
-        """Raise ValueError where turns of that size could not be taken, or not be repeated."""
+        """Raise ValueError if turns of this size are impossible, or not repeatable."""
         replay, turn_size = self.replay, self.run.turn_size
         robots = self.actor.num_arenas * self.arena.num_robots
         samples = turn_size * replay.samples_per_insert
         steps = samples / self.learner.batch_size
         reasons = {
-            "takes one actor (run.actors)": self.run.actors > 1,
-            "takes one replay.shards": replay.shards > 1,
-            'takes a log, and replay.fsync "off" keeps none': replay.fsync == "off",
-            'takes replay.sampler "uniform": priorities come when they come': replay.prioritized,
-            f"is no multiple of {robots}, the robots of one actor": turn_size % robots,
-            "x replay.samples_per_insert is no multiple of the learner's request, "
+            "needs a single actor (run.actors)": self.run.actors > 1,
+            "needs a single shard (replay.shards)": replay.shards > 1,
+            'needs a log, and replay.fsync "off" keeps none': replay.fsync == "off",
+            'needs replay.sampler "uniform": priorities arrive at any time': replay.prioritized,
+            f"is not a multiple of {robots}, the robots of one actor": turn_size % robots,
+            "x replay.samples_per_insert is not a multiple of the learner's request, "
             f"{self.learner.sample_size}": not samples or samples % self.learner.sample_size,
-            f"ends at learner steps that are multiples of {steps:g}, and run.learner_steps "
-            f"{self.run.learner_steps} is none": steps and self.run.learner_steps % steps,
+            f"ends at learner steps that are multiples of {steps:g}, unlike run.learner_steps "
+            f"{self.run.learner_steps}": steps and self.run.learner_steps % steps,
             f"does not fit in replay.capacity, with replay.min_size {replay.min_size}": (
                 turn_size + replay.min_size + robots > replay.capacity
             ),
@@ -495,7 +497,7 @@ class Config(Section):
 
 
 def sections() -> dict[str, type[Section]]:
-    """Section name to its class, in the order of the file."""
+    """The class of each section by name, in the order of the file."""
     return {
         name: cast(type[Section], info.annotation) for name, info in Config.model_fields.items()
     }

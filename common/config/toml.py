@@ -1,4 +1,4 @@
-"""A configuration as TOML text that reads back to the same configuration."""
+"""Writing a configuration as TOML."""
 
 import json
 from typing import Any
@@ -7,7 +7,7 @@ from mrcdrl.common.config.schema import Config
 
 
 def to_toml(config: Config) -> str:
-    """The configuration as a TOML file that reads back to the same."""
+    """TOML text that reads back to the same configuration."""
     lines: list[str] = []
     for section, values in config.model_dump().items():
         lines.append(f"[{section}]")

@@ -85,7 +85,7 @@ class Pace:
         return cls(actors, actors * rate, publications_per_s)
 
     @classmethod
-    def held(cls, config: Config, actors: int, rate: float, updates_per_s: float) -> "Pace":
+    def throttled(cls, config: Config, actors: int, rate: float, updates_per_s: float) -> "Pace":
         """The rate limiter lets in what the learner's updates draw."""
         drawn = updates_per_s * config.learner.batch_size / config.replay.samples_per_insert
         learner = config.learner

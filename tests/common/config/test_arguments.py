@@ -1,4 +1,4 @@
-"""Flags out of the schema, and what is said of those that are none."""
+"""Flags made from the schema, and suggestions for unknown ones."""
 
 import pytest
 
@@ -20,7 +20,7 @@ def given(*argv: str) -> dict[str, str]:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
-    """The one line that is said of these arguments."""
+    """The one-line error for these arguments."""
     with pytest.raises(SystemExit) as ended:
         make_parser().parse_args(argv)
     assert ended.value.code == 2
@@ -79,7 +79,7 @@ def test_flags_reach_the_configuration() -> None:
         ("--run_dir", "--run-dir"),
     ],
 )
-def test_an_unknown_flag_is_told_the_nearest(
+def test_an_unknown_flag_gets_the_nearest_as_a_suggestion(
     argument: str, near: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = refused(capsys, argument)
@@ -87,7 +87,7 @@ def test_an_unknown_flag_is_told_the_nearest(
     assert "see mrcdrl test --help" in line
 
 
-def test_what_is_like_nothing_is_told_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_argument_like_no_flag_gets_no_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert refused(capsys, "xyzzy") == "mrcdrl: unknown argument xyzzy (see mrcdrl test --help)\n"
 
 

@@ -1,4 +1,4 @@
-"""Where a value comes from, what is refused and why, and that the paper's values are its own."""
+"""Sources and precedence of settings, what is refused and why, and the presets' values."""
 
 import re
 import tomllib
@@ -38,7 +38,7 @@ def refusal(
     overrides: dict[str, str] | None = None,
     environ: dict[str, str] | None = None,
 ) -> str:
-    """The one line that is said of this configuration."""
+    """The one-line error for this configuration."""
     with pytest.raises(ConfigError) as refused:
         load(source, overrides, environ)
     assert "\n" not in str(refused.value)
@@ -159,10 +159,22 @@ def test_a_broken_file_below_is_named(write: Any) -> None:
 
 
 IMPOSSIBLE = {
-    "value too large": ({"arena.num_robots": "11"}, "arena.num_robots: .*10 .given 11."),
-    "no such choice": ({"agent.kind": "duell"}, "agent.kind: .*'duel', 'ddqn' or 'dqn'"),
-    "not a number": ({"agent.gamma": "nan"}, "agent.gamma: "),
-    "half a robot": ({"arena.num_robots": "2.5"}, "arena.num_robots: .*given 2.5"),
+    "value too large": ({"arena.num_robots": "11"}, "robots: must be between 1 and 10 .given 11."),
+    "value too small": ({"arena.num_robots": "0"}, "robots: must be between 1 and 10 .given 0."),
+    "value at an open limit": ({"arena.turn_deg": "180"}, "deg: must be above 0 and below 180 "),
+    "value without an upper limit": ({"run.actors": "-1"}, "run.actors: must be at least 0 "),
+    "no such choice": ({"agent.kind": "duell"}, "agent.kind: must be 'duel', 'ddqn' or 'dqn' "),
+    "not a number": ({"agent.gamma": "nan"}, "agent.gamma: must be above 0 and below 1 .given nan"),
+    "half a robot": ({"arena.num_robots": "2.5"}, "must be a whole number .given 2.5"),
+    "text for a count": ({"arena.num_robots": "two"}, "must be a whole number .given 'two'"),
+    "text for a number": ({"agent.gamma": "high"}, "agent.gamma: must be a number .given 'high'"),
+    "text for a switch": ({"learner.symmetries": "no way"}, "must be true or false"),
+    "a number for text": ({"learner.device": "3"}, "learner.device: must be text .given 3"),
+    "text for a list": ({"transport.connect": "tcp/a:1"}, "connect: must be a list .given 'tcp"),
+    "text in a schedule": (
+        {"exploration.schedule": "[[0, 'x']]"},
+        r"schedule\.0\.1: must be a number .given 'x'",
+    ),
     "robots as wide as the arena": ({"arena.robot_radius_px": "300"}, "no robot of radius 300"),
     "a target too few": ({"arena.targets_px": "[[1, 2]]"}, "1 targets for 2 robots; give 2, one a"),
     "an obstacle without size": ({"arena.obstacles_px": "[[1, 2, 0]]"}, "radius that is not above"),
@@ -185,14 +197,17 @@ IMPOSSIBLE = {
     **{
         f"turns {name}": ({"run.turn_size": "64", **overrides}, f"turn_size [0-9]+ .*{reason}")
         for name, (overrides, reason) in {
-            "of two actors": ({"run.actors": "2"}, "takes one actor"),
-            "of two shards": ({"replay.shards": "2"}, "takes one replay.shards"),
-            "without a log": ({"replay.fsync": "off"}, "takes a log"),
-            "by priorities": ({"replay.sampler": "prioritized"}, "takes replay.sampler"),
-            "of half a frame": ({"run.turn_size": "72"}, "is no multiple of 16, the robots"),
+            "of two actors": ({"run.actors": "2"}, "needs a single actor"),
+            "of two shards": ({"replay.shards": "2"}, "needs a single shard"),
+            "without a log": ({"replay.fsync": "off"}, "needs a log"),
+            "by priorities": ({"replay.sampler": "prioritized"}, "needs replay.sampler"),
+            "of half a frame": ({"run.turn_size": "72"}, "is not a multiple of 16, the robots"),
             "of half a request": ({"learner.batches_per_request": "5"}, "the learner's request"),
             "without an end": ({"replay.samples_per_insert": "0"}, "the learner's request"),
-            "broken off": ({"run.learner_steps": "40"}, "multiples of 16, and run.learner_steps"),
+            "broken off": (
+                {"run.learner_steps": "40"},
+                "multiples of 16, unlike run.learner_steps",
+            ),
             "beyond the table": ({"replay.capacity": "50_050"}, "does not fit in replay.capacity"),
         }.items()
     },
@@ -324,7 +339,7 @@ def test_the_way_to_a_run_is_known_before_its_other_settings() -> None:
 
 
 def test_a_wrong_way_to_a_run_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"transport\.timeout_s: .*greater than 0"):
+    with pytest.raises(ConfigError, match=r"transport\.timeout_s: must be above 0 .given -1"):
         load_transport({"transport.timeout_s": "-1"}, environ={})
 
 
@@ -337,5 +352,5 @@ def test_the_environment_counts_in_a_service_that_joins() -> None:
 
 @pytest.mark.parametrize("name", ["ca", "certificate", "key"])
 def test_certificates_are_given_together(name: str) -> None:
-    with pytest.raises(ConfigError, match="ca, certificate and key are given together"):
+    with pytest.raises(ConfigError, match="give ca, certificate and key together"):
         load_transport({f"transport.{name}": "file.pem"}, environ={})
