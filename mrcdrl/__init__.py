@@ -1,1 +1,80 @@
-"""MRCDRL."""
+"""Distributed actor-learner for multi-robot coordination from images, over Eclipse Zenoh.
+
+    import mrcdrl
+
+    config = mrcdrl.load_config("quick", {"arena.num_robots": "4"})
+    env = mrcdrl.ArenaParallelEnv(config.arena)  # pip install 'mrcdrl[env]'
+    policy = mrcdrl.load_policy("runs/four")  # pip install 'mrcdrl[learn]'
+    with mrcdrl.LivePolicy("four", "tcp/127.0.0.1:7447") as policy:
+        actions = policy.act(images)
+
+The names in `__all__` are the public API. Each is imported on first use, so `import mrcdrl` alone
+loads neither PyTorch nor numpy. A name whose extra is not installed raises ImportError.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mrcdrl.common.arena import Arena
+    from mrcdrl.common.arena.controllers import CONTROLLERS, make_controller
+    from mrcdrl.common.arena.envs.parallel_env import ArenaParallelEnv
+    from mrcdrl.common.arena.envs.sb3 import ArenaVecEnv
+    from mrcdrl.common.arena.envs.vector_env import ArenaVectorEnv
+    from mrcdrl.common.config import ArenaConfig, Config, load_config
+    from mrcdrl.common.errors import ConfigError, MrcdrlError
+    from mrcdrl.common.model.saved_policy import load_policy
+    from mrcdrl.common.sync.live_policy import LivePolicy
+
+    __version__: str
+
+__all__ = [
+    "CONTROLLERS",
+    "Arena",
+    "ArenaConfig",
+    "ArenaParallelEnv",
+    "ArenaVecEnv",
+    "ArenaVectorEnv",
+    "Config",
+    "ConfigError",
+    "LivePolicy",
+    "MrcdrlError",
+    "__version__",
+    "load_config",
+    "load_policy",
+    "make_controller",
+]
+
+_MODULES = {
+    "Arena": "common.arena",
+    "ArenaConfig": "common.config",
+    "ArenaParallelEnv": "common.arena.envs.parallel_env",
+    "ArenaVecEnv": "common.arena.envs.sb3",
+    "ArenaVectorEnv": "common.arena.envs.vector_env",
+    "CONTROLLERS": "common.arena.controllers",
+    "Config": "common.config",
+    "ConfigError": "common.errors",
+    "LivePolicy": "common.sync.live_policy",
+    "MrcdrlError": "common.errors",
+    "load_config": "common.config",
+    "load_policy": "common.model.saved_policy",
+    "make_controller": "common.arena.controllers",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name on first use, and keep it."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: object = version("mrcdrl")
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(f"mrcdrl.{_MODULES[name]}"), name)
+    else:
+        raise AttributeError(f"module 'mrcdrl' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

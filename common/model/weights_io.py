@@ -81,7 +81,7 @@ def network_from_bytes(
         or not _in_range(view_px, 255)
         or not _in_range(num_actions, 255)
     ):
-        raise CheckpointError(f"weights name no network of ours: {json.dumps(metadata)[:200]}")
+        raise CheckpointError(f"weights of an unknown network: {json.dumps(metadata)[:200]}")
     try:
         network = QNetwork(
             kind, stack=stack, view_px=view_px, num_actions=num_actions, compute_dtype=compute_dtype
@@ -121,11 +121,9 @@ def _read_metadata(payload: bytes) -> dict[str, object]:
         header = json.loads(payload[8 : 8 + length])
         metadata = json.loads(header["__metadata__"][_METADATA_KEY])
     except (struct.error, ValueError, OverflowError, KeyError, TypeError, RecursionError) as error:
-        raise CheckpointError(
-            f"weights of {len(payload)} bytes are unreadable: no header of ours"
-        ) from error
+        raise CheckpointError("not an MRCDRL weights file") from error
     if not isinstance(metadata, dict):
-        raise CheckpointError("weights are unreadable: the header is no table")
+        raise CheckpointError("not an MRCDRL weights file")
     return metadata
 
 

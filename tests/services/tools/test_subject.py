@@ -1,4 +1,4 @@
-"""What is judged, from flags; and what is wrong with them."""
+"""The subject that flags name, and the flags that are refused."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_files import write_weights
 from mrcdrl.common.model.weights_io import weights_to_bytes
 from mrcdrl.services.evaluator.trial import ControllerPlayer, PolicyPlayer
-from mrcdrl.services.tools.subject import Subject, subject, subject_parser, weights_path
+from mrcdrl.services.tools.subject import Subject, subject, subject_parser
 
 VIEW_PX = 32
 VIEW = f"--arena.view_px={VIEW_PX}"
@@ -44,7 +44,7 @@ def test_either_weights_or_a_controller(argv: tuple[str, ...]) -> None:
         named(*argv)
 
 
-def test_weights_are_loaded_with_what_is_known_of_them(tmp_path: Path, payload: bytes) -> None:
+def test_weights_are_loaded_with_their_manifest(tmp_path: Path, payload: bytes) -> None:
     known = {"weights_epoch": 1, "weights_version": 7, "learner_step": 700}
     write_weights(tmp_path / "best.safetensors", payload, known)
     found = named(tmp_path / "best.safetensors", VIEW)
@@ -54,14 +54,12 @@ def test_weights_are_loaded_with_what_is_known_of_them(tmp_path: Path, payload: 
     assert isinstance(found.player(0), PolicyPlayer)
 
 
-def test_weights_with_nothing_beside_them_are_version_0(tmp_path: Path, payload: bytes) -> None:
+def test_weights_without_a_manifest_are_version_0(tmp_path: Path, payload: bytes) -> None:
     (tmp_path / "some.safetensors").write_bytes(payload)
     assert named(tmp_path / "some.safetensors", VIEW).weights.order == (0, 0)
 
 
-def test_what_is_known_of_other_weights_is_not_told_of_these(
-    tmp_path: Path, payload: bytes
-) -> None:
+def test_the_manifest_of_other_weights_is_ignored(tmp_path: Path, payload: bytes) -> None:
     write_weights(tmp_path / "best.safetensors", payload, {"weights_version": 7})
     manifest = json.loads((tmp_path / "best.json").read_text())
     (tmp_path / "best.json").write_text(json.dumps({**manifest, "sha256": "0" * 64}))
@@ -86,22 +84,7 @@ def test_weights_of_another_view_are_refused(tmp_path: Path, payload: bytes) -> 
         named(tmp_path / "some.safetensors")
 
 
-def test_a_folder_stands_for_its_best_weights_or_the_newest(tmp_path: Path, payload: bytes) -> None:
-    checkpoints = tmp_path / "checkpoints"
-    with pytest.raises(CheckpointError, match="holds no weights"):
-        weights_path(tmp_path)
-    for step in (5, 40, 300):
-        folder = checkpoints / f"step_{step:09d}"
-        folder.mkdir(parents=True)
-        (folder / "model.safetensors").write_bytes(payload)
-    assert weights_path(tmp_path) == checkpoints / "step_000000300" / "model.safetensors"
-    folder = checkpoints / "step_000000040"
-    assert weights_path(folder) == folder / "model.safetensors"
-    (checkpoints / "best.safetensors").write_bytes(payload)
-    assert weights_path(tmp_path) == checkpoints / "best.safetensors"
-
-
-def test_a_runs_weights_are_judged_in_its_own_arena(tmp_path: Path, payload: bytes) -> None:
+def test_a_runs_weights_play_in_its_own_arena(tmp_path: Path, payload: bytes) -> None:
     own = load_config("smoke", {"arena.num_robots": "4", "arena.view_px": str(VIEW_PX)}, {})
     (tmp_path / "config.toml").write_text(to_toml(own))
     write_weights(tmp_path / "checkpoints" / "best.safetensors", payload, {})
