@@ -1,1 +1,1 @@
-"""The messages that cross a process boundary, and their bytes."""
+"""Messages between processes, their bytes, and the metrics."""

@@ -1,10 +1,10 @@
-"""How a message's large arrays follow its map, and how messages travel together.
+"""Framing: large arrays that follow a message's map, and messages that travel as a set.
 
     0xC1 "map", length of the map uint32, the map, zeros, array, zeros, array, …
     0xC1 "set", number of messages uint32, length of each uint32, zeros, message, zeros, …
 
-Invariants: no msgpack begins with 0xC1, so a map alone stands for itself; each array and message
-begins at a multiple of 64 from the start; nothing is copied, neither here nor when taken apart.
+Invariants: no msgpack begins with 0xC1, so a map without arrays needs no head; each array and
+message begins at a multiple of 64 from the start; neither joining nor splitting copies anything.
 """
 
 import struct
@@ -26,18 +26,18 @@ def padded(length: int) -> int:
 
 
 def join_map(packed: bytes, arrays: Sequence[memoryview]) -> list[Part]:
-    """A map and what follows it, in parts."""
+    """A map and the arrays that follow it, in parts."""
     if not arrays:
         return [packed]
     return _in_line(_HEAD.pack(_MAP, len(packed)) + packed, [[array] for array in arrays])
 
 
 def split_map(data: memoryview) -> tuple[memoryview, memoryview]:
-    """The map, and the arrays after it; raises WireError where the head is wrong."""
+    """The map, and the arrays after it; raises WireError if the head is wrong."""
     if data[: len(_MAP)] != _MAP:
         return data, data[:0]
     if len(data) < _HEAD.size:
-        raise WireError("a message that ends in its head")
+        raise WireError("the message ends within its head")
     _, length = _HEAD.unpack_from(data)
     end = _HEAD.size + length
     if end > len(data):
@@ -46,7 +46,7 @@ def split_map(data: memoryview) -> tuple[memoryview, memoryview]:
 
 
 def join_set(messages: Sequence[Sequence[Part]]) -> list[Part]:
-    """Messages, each in parts, as one; one alone stands for itself."""
+    """Join messages, each in parts, to a set; a single one needs no head."""
     if len(messages) == 1:
         return list(messages[0])
     lengths = [sum(map(len, parts)) for parts in messages]
@@ -55,7 +55,7 @@ def join_set(messages: Sequence[Sequence[Part]]) -> list[Part]:
 
 
 def split_set(data: Part) -> list[memoryview]:
-    """The messages of a set; raises WireError where it is none that join_set would make."""
+    """The messages of a set; raises WireError if `join_set` would not have made it."""
     view = memoryview(data)
     if view[: len(_SET)] != _SET:
         return [view]
@@ -65,7 +65,7 @@ def split_set(data: Part) -> list[memoryview]:
             raise WireError(f"a set of {count} messages, not 1 to {_MAX_MESSAGES}")
         lengths = struct.unpack_from(f"<{count}I", view, _HEAD.size)
     except struct.error as error:
-        raise WireError("a set that ends in its head") from error
+        raise WireError("the set ends within its head") from error
     messages, end = [], _HEAD.size + 4 * count
     for length in lengths:
         start = padded(end)

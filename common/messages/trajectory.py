@@ -1,7 +1,7 @@
-"""The nouns of the data path: what an actor records, what replay keeps, what a learner reads.
+"""The nouns of the data path: all messages between actors, replay, learner and watchers.
 
 Invariants: every array's dtype and shape is declared here and nowhere else; instances are
-frozen; nothing here knows of a clock, a lock or a transport.
+frozen; no clock, lock or transport appears here.
 
 Shapes: H = frames stacked in one state - 1, T = transitions of a chunk, n = longest n-step
 return, W = H + 1 + n records that one transition may touch, B = transitions of a batch,
@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
-# in full, since numpy.typing.NDArray hides its dtype from version 2.5 on, where it is an alias
+# Spelled out because numpy.typing.NDArray, an alias from 2.5 on, hides its dtype.
 UInt8Array = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
 Float32Array = np.ndarray[tuple[Any, ...], np.dtype[np.float32]]
 Float64Array = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
@@ -24,7 +24,7 @@ Int64Array = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
 NUM_ACTIONS = 3  # left, straight, right (paper section 3)
-NO_SLOT = -1  # of an actor to which no slot of exploration is leased
+NO_SLOT = -1  # an actor without an exploration slot
 
 
 class StepType(IntEnum):
@@ -45,14 +45,14 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TimeStep:
-    """What one arena returns for all of its robots after a reset or a step."""
+    """An arena's result for all of its robots, after a reset or a step."""
 
     step_type: StepType
-    records: UInt8Array  # [K, R], one observation record a robot
+    records: UInt8Array  # [K, R], one observation record for each robot
     rewards: Float32Array  # [K], zero at FIRST
     discount: float  # 0 after a termination (success, failure), else 1; gamma is the agent's
-    collided: BoolArray  # [K], whose move was undone in this frame
-    hit_wall: BoolArray  # [K], of those that collided, whose way led into a wall or obstacle
+    collided: BoolArray  # [K], the robot's move was undone in this frame
+    hit_wall: BoolArray  # [K], it collided with a wall or obstacle
     outcome: Outcome | None = None  # set at LAST
 
     @property
@@ -66,7 +66,7 @@ class TimeStep:
 
 @dataclass(frozen=True, slots=True)
 class TimeSteps:
-    """What arenas stepped together return, after a step: the time steps of A arenas."""
+    """Time steps of A arenas stepped together, after a step."""
 
     records: UInt8Array  # [A, K, R]
     rewards: Float32Array  # [A, K]
@@ -78,7 +78,7 @@ class TimeSteps:
         return (self[arena] for arena in range(len(self.outcomes)))
 
     def __getitem__(self, arena: int) -> TimeStep:
-        """Of one arena."""
+        """The time step of one arena."""
         outcome = self.outcomes[arena]
         terminated = outcome is not None and outcome is not Outcome.TIMEOUT
         return TimeStep(
@@ -94,18 +94,18 @@ class TimeSteps:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Consecutive transitions of one robot that stand alone: history before, bootstrap after.
+    """Consecutive transitions of one robot, with the history before and the bootstrap after.
 
     Transition t (0 <= t < T) has state records[t : t + H + 1], action actions[t], n-step return
     rewards[t], and bootstraps with discounts[t] from the state
-    records[t + k : t + k + H + 1], k = bootstrap_offsets[t]. At an episode's start its first
-    record, and at its end its last, is repeated to fill the window.
+    records[t + k : t + k + H + 1], k = bootstrap_offsets[t]. The first record of an episode is
+    repeated before its start, the last one after its end, to fill the window.
     """
 
     actor: str
     incarnation: int  # differs for every start of the same actor
     sequence: int  # 0, 1, 2, … without gaps within an incarnation
-    weights_version: int  # the oldest version that chose one of these actions
+    weights_version: int  # the oldest that chose one of these actions
     records: UInt8Array  # [H + T + n, R]
     actions: UInt8Array  # [T]
     rewards: Float32Array  # [T], sum of k discounted rewards
@@ -119,18 +119,18 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Transitions drawn from the table, still as records."""
+    """Transitions sampled from the table, as records."""
 
-    keys: Int64Array  # [B], names the transition for a priority update
-    probabilities: Float64Array  # [B], of having been drawn
-    table_size: int  # transitions in the table when drawn
-    total_priority: float  # of them, to the power alpha; their number where sampling is uniform
+    keys: Int64Array  # [B], identify the transitions in a priority update
+    probabilities: Float64Array  # [B], of being sampled
+    table_size: int  # transitions in the table when sampled
+    total_priority: float  # sum of scaled priorities in the table; its size if sampling is uniform
     actions: UInt8Array  # [B]
     rewards: Float32Array  # [B]
     discounts: Float32Array  # [B]
     bootstrap_offsets: UInt8Array  # [B]
-    weights_versions: Int64Array  # [B], of the chunk the transition came from
-    records: UInt8Array  # [B, W, R]; last, so that a message of it can be made around it
+    weights_versions: Int64Array  # [B], of the transitions' chunks
+    records: UInt8Array  # [B, W, R]; last, so that a message can be built around it
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -147,9 +147,9 @@ class InsertReply:
 
 @dataclass(frozen=True, slots=True)
 class Priorities:
-    """What a learner found of transitions it sampled; of a key given twice the last counts."""
+    """New priorities of sampled transitions; the last one counts for a repeated key."""
 
-    keys: Int64Array  # [B], of Samples
+    keys: Int64Array  # [B], from Samples
     priorities: Float32Array  # [B], absolute TD errors
 
 
@@ -158,27 +158,27 @@ class PrioritiesReply:
     """Replay's acknowledgement of priorities."""
 
     updated: int
-    ignored: int  # of transitions evicted meanwhile; all of them where sampling is uniform
+    ignored: int  # of transitions evicted meanwhile; all of them if sampling is uniform
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseRequest:
-    """An actor's wish for a slot of exploration: a first one, its own again, or to give it back."""
+    """An actor's request to get, to renew or to return an exploration slot."""
 
     actor: str
     incarnation: int  # differs for every start of the actor
-    slot: int  # it had last; NO_SLOT where it had none
-    holds: bool  # by its own clock that slot is its own still
-    ends: bool  # it needs none any more
+    slot: int  # the last one it had; NO_SLOT if none
+    holds: bool  # by its own clock, the lease of that slot still runs
+    ends: bool  # it needs no slot any more
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseReply:
-    """Replay's answer: the slot that is the actor's own for `lease_s` from when it asked."""
+    """Replay's answer: a slot leased to the actor for `lease_s` from when it asked."""
 
     slot: int  # NO_SLOT: none now, ask again
-    rank: int  # its place on the ladder
-    num_places: int  # of the ladder
+    rank: int  # exploration rank: its place on the ladder
+    num_places: int  # on the ladder
     lease_s: float
 
 
@@ -186,18 +186,18 @@ class LeaseReply:
 class Weights:
     """The network's parameters as published; newer means a larger (epoch, version).
 
-    Make them by `of`; one whose digest is not the payload's is torn, and the wire refuses it.
+    `of` computes the digest. Weights whose digest does not match are torn; the wire refuses them.
     """
 
     epoch: int  # rises when a run's learner starts from new parameters
-    version: int  # rises with every publication, also over restarts
+    version: int  # rises with every publication, even across restarts
     learner_step: int
     payload: bytes  # safetensors: arrays by parameter name, all of one precision
     digest: str  # SHA-256 of the payload, hexadecimal
 
     @classmethod
     def of(cls, epoch: int, version: int, learner_step: int, payload: bytes) -> Self:
-        """With the digest of this payload."""
+        """Make weights with the digest of the payload."""
         return cls(epoch, version, learner_step, payload, hashlib.sha256(payload).hexdigest())
 
     @property
@@ -211,14 +211,14 @@ class EpisodeSummary:
 
     actor: str
     arena: int
-    episode: int  # counts this actor's episodes
+    episode: int  # counter of this actor
     outcome: Outcome
     frames: int  # env steps of the episode
     score: float  # sum of rewards, mean over robots (Fig. 6a)
     collisions: int
     epsilon: float
     weights_version: int
-    mean_q: float  # mean over the episode of the greedy action's value (Fig. 7a-c)
+    mean_q: float  # value of the greedy action, mean over the episode (Fig. 7a-c)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +246,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """What a service says of itself once a second; the metrics' names are in docs/metrics.md."""
+    """A service's statistics, once a second; docs/metrics.md lists the metrics."""
 
     role: str
     id: str
@@ -256,7 +256,7 @@ class Stats:
 
 @dataclass(frozen=True, slots=True)
 class SampleRequest:
-    """A learner's wish for mini-batches."""
+    """A learner's request for mini-batches."""
 
     batch_size: int
-    learner_step: int = -1  # of a run that takes turns: drawn for the step after so many
+    learner_step: int = -1  # in lockstep, the steps made before the one that it samples for

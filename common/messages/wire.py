@@ -1,11 +1,11 @@
-"""Messages to bytes and back, both pure; docs/wire.md describes the same for other languages.
+"""Encoding and decoding of messages, both pure; docs/wire.md describes it for other languages.
 
 A message is one msgpack map: its fields by name, and `schema`, the message's name and version.
-A number array is a pair [shape, bytes], C order, little-endian, of the dtype that
-`trajectory.py` declares; a large one follows the map (`framing.py`), and the pair is [shape, place
-among what follows]. Invariants: what `decode` returns has exactly the declared
-types, dtypes and mutually fitting shapes; any other bytes raise WireError with the reason; large
-arrays are copied neither way.
+A number array is a pair [shape, bytes], C order, little-endian, of the dtype that `trajectory.py`
+declares; a large one follows the map (`framing.py`), and its pair is [shape, place].
+
+Invariants: what `decode` returns has exactly the declared types, dtypes and matching shapes; any
+other bytes raise WireError with the reason; large arrays are never copied.
 """
 
 import enum
@@ -42,7 +42,7 @@ from mrcdrl.common.runtime.names import MAX_NAME
 
 M = TypeVar("M")
 _MAX_NDIM = 8
-_LARGE_BYTES = 8192  # of an array that follows the map
+_LARGE_BYTES = 8192  # arrays of this size or more follow the map
 
 
 def _check_chunk(chunk: Chunk) -> str | None:
@@ -53,15 +53,15 @@ def _check_chunk(chunk: Chunk) -> str | None:
     if length == 0 or any(len(a) != length for a in arrays):
         return "actions, rewards, discounts and bootstrap_offsets differ in length, or are empty"
     if len(chunk.priorities) not in (0, length):
-        return "priorities has neither no entry nor one a transition"
+        return "priorities is neither empty nor as long as actions"
     if chunk.records.ndim != 2 or chunk.records.shape[0] <= length:
-        return "records is no matrix with more rows than there are transitions"
+        return "records is not a matrix with more rows than there are transitions"
     if not (np.isfinite(chunk.rewards).all() and np.isfinite(chunk.discounts).all()):
         return "a reward or discount is not finite"
     if not _may_be_errors(chunk.priorities):
         return "a priority is negative or not finite"
     if chunk.actions.max() >= NUM_ACTIONS:
-        return f"an action is none of {NUM_ACTIONS}"
+        return f"an action is not below {NUM_ACTIONS}"
     if chunk.bootstrap_offsets.min() < 1:
         return "a bootstrap offset is 0"
     if chunk.sequence < 0 or chunk.weights_version < 0:
@@ -82,7 +82,7 @@ def _check_samples(samples: Samples) -> str | None:
         samples.weights_versions,
     )
     if samples.records.ndim != 3 or any(v.ndim != 1 for v in vectors):
-        return "records is no array of 3 dimensions, or another is no vector"
+        return "records does not have 3 dimensions, or another array is not a vector"
     if any(len(v) != len(samples.records) for v in vectors):
         return "arrays differ in length"
     if not ((samples.probabilities > 0).all() and (samples.probabilities <= 1).all()):
@@ -94,7 +94,7 @@ def _check_samples(samples: Samples) -> str | None:
 
 def _check_priorities(message: Priorities) -> str | None:
     if message.keys.ndim != 1 or message.keys.shape != message.priorities.shape:
-        return "keys and priorities are no vectors of one length"
+        return "keys and priorities are not vectors of one length"
     if not _may_be_errors(message.priorities):
         return "a priority is negative or not finite"
     return None
@@ -106,7 +106,7 @@ def _check_lease_request(request: LeaseRequest) -> str | None:
     if request.slot < NO_SLOT:
         return f"slot is below {NO_SLOT}"
     if request.holds and request.slot == NO_SLOT:
-        return "it holds a slot and names none"
+        return "holds is true, but slot names none"
     return None
 
 
@@ -114,7 +114,7 @@ def _check_lease_reply(reply: LeaseReply) -> str | None:
     if reply.slot < NO_SLOT:
         return f"slot is below {NO_SLOT}"
     if not 0 <= reply.rank < reply.num_places:
-        return f"rank {reply.rank} is none of {reply.num_places} places"
+        return f"rank {reply.rank} is not among {reply.num_places} places"
     if not 0 < reply.lease_s < math.inf:
         return "lease_s is not above 0 and finite"
     return None
@@ -122,7 +122,7 @@ def _check_lease_reply(reply: LeaseReply) -> str | None:
 
 def _check_weights(weights: Weights) -> str | None:
     if hashlib.sha256(weights.payload).hexdigest() != weights.digest:
-        return "the payload is not what its digest says: torn or altered"
+        return "the payload does not match its digest: torn or altered"
     return None
 
 
@@ -156,12 +156,12 @@ _CHECKS: dict[type, Callable[[Any], str | None]] = {
 
 
 def encode(message: Any) -> bytes:
-    """The bytes of any message of the schema."""
+    """The bytes of a message."""
     return b"".join(encode_parts(message))
 
 
 def encode_parts(message: Any) -> list[Part]:
-    """The same bytes in parts; large arrays are views of the message's memory, in order."""
+    """The bytes of a message in parts; large arrays are views of the message's memory."""
     table: dict[str, Any] = {"schema": _SCHEMAS[type(message)]}
     large: list[memoryview] = []
     place = 0
@@ -180,15 +180,15 @@ def encode_parts(message: Any) -> list[Part]:
 
 
 def decode(cls: type[M], data: Part) -> M:
-    """The message of class `cls` that `data` holds; its arrays are read-only views of `data`.
+    """The message of class `cls` in `data`; its arrays are read-only views of `data`.
 
-    Raises WireError, with the reason, for whatever `encode` would not have written.
+    Raises WireError, with the reason, for anything that `encode` would not have written.
     """
     packed, arrays = split_map(memoryview(data).toreadonly())
     try:
         table = msgpack.unpackb(packed, raw=False, strict_map_key=True, use_list=True)
     except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
-        raise WireError(f"no msgpack: {type(error).__name__}") from error
+        raise WireError(f"not msgpack: {type(error).__name__}") from error
     if not isinstance(table, dict):
         raise WireError("not a map")
     schema = table.pop("schema", None)
@@ -221,12 +221,12 @@ def decode(cls: type[M], data: Part) -> M:
 
 
 def _follows(value: Any) -> bool:
-    """Whether this is the pair of an array after the map."""
+    """Whether this is the pair of an array that follows the map."""
     return isinstance(value, list) and len(value) == 2 and type(value[1]) is int
 
 
 def _begin(arrays: memoryview, place: int, due: int) -> memoryview:
-    """What begins at a place; ValueError unless it is where the next array is due."""
+    """The bytes from `place` on; raises ValueError if the next array is due elsewhere."""
     if place != due:
         raise ValueError(f"an array at {place} where {due} is due")
     return arrays[place:]
@@ -261,12 +261,12 @@ def _reader(hint: Any) -> Callable[[Any], Any]:
 def _array_reader(dtype: np.dtype[Any]) -> Callable[[Any], Any]:
     def read(value: Any) -> Any:
         if not (isinstance(value, list) and len(value) == 2):
-            raise TypeError("no pair [shape, bytes]")
+            raise TypeError("not a pair [shape, bytes]")
         shape, data = value
         if not isinstance(data, Part) or not isinstance(shape, list) or len(shape) > _MAX_NDIM:
-            raise TypeError("no pair [shape, bytes]")
+            raise TypeError("not a pair [shape, bytes]")
         if any(type(n) is not int or n < 0 for n in shape):
-            raise ValueError("a length in the shape is no natural number")
+            raise ValueError("the shape has a length that is not a natural number")
         length = math.prod(shape) * dtype.itemsize
         if isinstance(data, memoryview) and length <= len(data):
             data = data[:length]
@@ -281,7 +281,7 @@ def _array_reader(dtype: np.dtype[Any]) -> Callable[[Any], Any]:
 def _tuple_reader(readers: list[Callable[[Any], Any]]) -> Callable[[Any], Any]:
     def read(value: Any) -> Any:
         if not isinstance(value, list) or len(value) != len(readers):
-            raise TypeError(f"no list of {len(readers)}")
+            raise TypeError(f"not a list of {len(readers)}")
         return tuple(r(v) for r, v in zip(readers, value, strict=True))
 
     return read
@@ -290,7 +290,7 @@ def _tuple_reader(readers: list[Callable[[Any], Any]]) -> Callable[[Any], Any]:
 def _dict_reader(reader: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def read(value: Any) -> Any:
         if not isinstance(value, dict) or any(type(k) is not str for k in value):
-            raise TypeError("no map with names")
+            raise TypeError("not a map with string keys")
         return {k: reader(v) for k, v in value.items()}
 
     return read
@@ -301,7 +301,7 @@ def _enum_reader(expected: type[enum.StrEnum]) -> Callable[[Any], Any]:
 
     def read(value: Any) -> Any:
         if not isinstance(value, str) or value not in members:
-            raise TypeError(f"none of {', '.join(members)}")
+            raise TypeError(f"not one of {', '.join(members)}")
         return members[value]
 
     return read
@@ -309,13 +309,13 @@ def _enum_reader(expected: type[enum.StrEnum]) -> Callable[[Any], Any]:
 
 def _read_float(value: Any) -> float:
     if type(value) not in (float, int):
-        raise TypeError("no number")
+        raise TypeError("not a number")
     return float(value)
 
 
 def _read_int(value: Any) -> int:
     if type(value) is not int:
-        raise TypeError("no integer")
+        raise TypeError("not an integer")
     if not -(2**63) <= value < 2**63:
         raise ValueError("integer outside 64 bits")
     return value
@@ -324,7 +324,7 @@ def _read_int(value: Any) -> int:
 def _exact(expected: type) -> Callable[[Any], Any]:
     def read(value: Any) -> Any:
         if type(value) is not expected:
-            raise TypeError(f"no {expected.__name__}")
+            raise TypeError(f"not of type {expected.__name__}")
         return value
 
     return read

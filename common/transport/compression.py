@@ -30,14 +30,14 @@ def expanded(payload: bytes, max_message_bytes: int) -> bytes:
     if payload[: len(_MARK)] != _MARK:
         return payload
     if len(payload) < _HEAD.size:
-        raise WireError("a compressed message that ends in its head")
+        raise WireError("the compressed message ends within its head")
     _, length = _HEAD.unpack_from(payload)
     if length > max_message_bytes:
         raise WireError(f"{length} bytes exceed the limit of {max_message_bytes}")
     try:
         message: bytes = lz4.block.decompress(payload[_HEAD.size :], uncompressed_size=length)
     except lz4.block.LZ4BlockError as error:
-        raise WireError("a compressed message that is damaged") from error
+        raise WireError("the compressed message is damaged") from error
     if len(message) != length:
-        raise WireError(f"a compressed message of {len(message)} bytes, not {length}")
+        raise WireError(f"the compressed message has {len(message)} bytes, not {length}")
     return message

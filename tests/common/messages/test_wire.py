@@ -1,4 +1,4 @@
-"""What is encoded is decoded to the same, and whatever else arrives is refused as WireError."""
+"""Encoded messages decode to the same, and anything else raises WireError."""
 
 import contextlib
 import dataclasses
@@ -248,7 +248,7 @@ def table_of(message: Any) -> dict[str, Any]:
 
 
 def changed(message: Any, **fields: Any) -> bytes:
-    """The message's bytes with these fields otherwise; ... leaves one out."""
+    """The message's bytes with these fields changed; ... leaves one out."""
     table = {**table_of(message), **fields}
     packed: bytes = msgpack.packb({k: v for k, v in table.items() if v is not ...})
     return packed
@@ -267,12 +267,12 @@ def octets(*values: int) -> list[Any]:
 
 
 MALFORMED = {
-    "empty": (Chunk, b"", "no msgpack"),
-    "truncated": (Chunk, encode(CHUNK)[:-1], "no msgpack"),
-    "trailing bytes": (Chunk, encode(CHUNK) + b"\x00", "no msgpack"),
-    "never used byte": (Chunk, b"\xc1", "no msgpack"),
+    "empty": (Chunk, b"", "not msgpack"),
+    "truncated": (Chunk, encode(CHUNK)[:-1], "not msgpack"),
+    "trailing bytes": (Chunk, encode(CHUNK) + b"\x00", "not msgpack"),
+    "never used byte": (Chunk, b"\xc1", "not msgpack"),
     "not a map": (Chunk, msgpack.packb([1, 2]), "not a map"),
-    "number as key": (Chunk, msgpack.packb({1: 2}), "no msgpack"),
+    "number as key": (Chunk, msgpack.packb({1: 2}), "not msgpack"),
     "no schema": (Chunk, changed(CHUNK, schema=...), "NoneType.*'chunk/1' is due"),
     "another schema": (Chunk, encode(STATS), "'stats/1' where 'chunk/1' is due"),
     "newer schema": (Chunk, changed(CHUNK, schema="chunk/2"), "'chunk/2' where"),
@@ -280,39 +280,43 @@ MALFORMED = {
     "nested schema": (Chunk, b"\x81\xa6schema" + _DEEP, "'list' where"),
     "missing field": (Chunk, changed(CHUNK, actor=...), "unknown fields: actor"),
     "unknown field": (Chunk, changed(CHUNK, done=1), "unknown fields: done"),
-    "name as bytes": (Chunk, changed(CHUNK, actor=b"a"), "actor: no str"),
-    "name not UTF-8": (Chunk, encode(CHUNK).replace(b"actor-0", b"actor-\xff"), "no msgpack"),
-    "float for an integer": (Chunk, changed(CHUNK, incarnation=1.0), "incarnation: no integer"),
-    "bool for an integer": (Chunk, changed(CHUNK, sequence=True), "sequence: no integer"),
+    "name as bytes": (Chunk, changed(CHUNK, actor=b"a"), "actor: not of type str"),
+    "name not UTF-8": (Chunk, encode(CHUNK).replace(b"actor-0", b"actor-\xff"), "not msgpack"),
+    "float for an integer": (Chunk, changed(CHUNK, incarnation=1.0), "incarnation: not an integer"),
+    "bool for an integer": (Chunk, changed(CHUNK, sequence=True), "sequence: not an integer"),
     "integer of 65 bits": (Chunk, changed(CHUNK, sequence=2**63), "outside 64 bits"),
-    "text for a number": (EpisodeSummary, changed(EPISODE, score="1"), "score: no number"),
-    "unknown outcome": (EpisodeSummary, changed(EPISODE, outcome="draw"), "outcome: none of"),
-    "outcome no name": (EpisodeSummary, changed(EPISODE, outcome=[1]), "outcome: none of"),
+    "text for a number": (EpisodeSummary, changed(EPISODE, score="1"), "score: not a number"),
+    "unknown outcome": (EpisodeSummary, changed(EPISODE, outcome="draw"), "outcome: not one of"),
+    "outcome no name": (EpisodeSummary, changed(EPISODE, outcome=[1]), "outcome: not one of"),
     "integer for a bool": (
         InsertReply,
         changed(InsertReply(1, False, 2), duplicate=0),
-        "duplicate: no bool",
+        "duplicate: not of type bool",
     ),
-    "metrics no map": (Stats, changed(STATS, metrics=[]), "metrics: no map"),
-    "metric no number": (Stats, changed(STATS, metrics={"a": "b"}), "metrics: no number"),
-    "metric named by bytes": (Stats, changed(STATS, metrics={b"a": 1.0}), "metrics: no map"),
-    "array no pair": (Chunk, changed(CHUNK, actions=[1, 2, 3]), "actions: no pair"),
-    "shape no list": (Chunk, changed(CHUNK, actions=[2, b"ab"]), "actions: no pair"),
-    "array as text": (Chunk, changed(CHUNK, actions=[[2], "ab"]), "actions: no pair"),
-    "9 dimensions": (Chunk, changed(CHUNK, actions=[[1] * 9, b"a"]), "actions: no pair"),
+    "metrics no map": (Stats, changed(STATS, metrics=[]), "metrics: not a map"),
+    "metric no number": (Stats, changed(STATS, metrics={"a": "b"}), "metrics: not a number"),
+    "metric named by bytes": (Stats, changed(STATS, metrics={b"a": 1.0}), "metrics: not a map"),
+    "array no pair": (Chunk, changed(CHUNK, actions=[1, 2, 3]), "actions: not a pair"),
+    "shape no list": (Chunk, changed(CHUNK, actions=[2, b"ab"]), "actions: not a pair"),
+    "array as text": (Chunk, changed(CHUNK, actions=[[2], "ab"]), "actions: not a pair"),
+    "9 dimensions": (Chunk, changed(CHUNK, actions=[[1] * 9, b"a"]), "actions: not a pair"),
     "wrong dtype": (Chunk, changed(CHUNK, rewards=octets(1, 2)), "does not fit 2 bytes"),
     "negative shape": (Chunk, changed(CHUNK, records=[[-5, -4], b"a" * 20]), "natural number"),
     "fractional shape": (Chunk, changed(CHUNK, records=[[5.0, 4.0], b"a" * 20]), "natural number"),
     "huge shape": (Chunk, changed(CHUNK, records=[[2**40, 2**40], b""]), "does not fit 0 bytes"),
     "huge empty shape": (Chunk, changed(CHUNK, records=[[0, 2**64 - 1], b""]), "records: "),
     "too many for an array": (Chunk, changed(CHUNK, records=[[0, *[2**62] * 7], b""]), "records: "),
-    "records a vector": (Chunk, changed(CHUNK, records=octets(*range(20))), "no matrix"),
-    "too few records": (Chunk, changed(CHUNK, records=[[2, 4], b"a" * 8]), "no matrix"),
+    "records a vector": (Chunk, changed(CHUNK, records=octets(*range(20))), "not a matrix"),
+    "too few records": (Chunk, changed(CHUNK, records=[[2, 4], b"a" * 8]), "not a matrix"),
     "actions a number": (Chunk, changed(CHUNK, actions=[[], b"\1"]), "are vectors"),
     "priorities a number": (Chunk, changed(CHUNK, priorities=[[], b"\0" * 4]), "are vectors"),
     "long name": (Chunk, changed(CHUNK, actor="a" * 65), "more than 64 characters"),
-    "sampled actions a number": (Samples, changed(SAMPLES, actions=[[], b"\1"]), "is no vector"),
-    "sampled records a matrix": (Samples, changed(SAMPLES, records=[[2, 4], b"a" * 8]), "is no"),
+    "sampled actions a number": (Samples, changed(SAMPLES, actions=[[], b"\1"]), "is not a vector"),
+    "sampled records a matrix": (
+        Samples,
+        changed(SAMPLES, records=[[2, 4], b"a" * 8]),
+        "does not have 3 dim",
+    ),
     "actions a matrix": (Chunk, changed(CHUNK, actions=[[2, 1], b"ab"]), "are vectors"),
     "lengths differ": (Chunk, changed(CHUNK, actions=octets(1)), "differ in length"),
     "no transition": (
@@ -329,7 +333,7 @@ MALFORMED = {
     "NaN reward": (Chunk, changed(CHUNK, rewards=floats(1, np.nan)), "not finite"),
     "infinite discount": (Chunk, changed(CHUNK, discounts=floats(1, np.inf)), "not finite"),
     "negative priority": (Chunk, changed(CHUNK, priorities=floats(1, -1)), "priority is negative"),
-    "one priority of two": (Chunk, changed(CHUNK, priorities=floats(1)), "priorities has neither"),
+    "one priority of two": (Chunk, changed(CHUNK, priorities=floats(1)), "priorities is neither"),
     "offset 0": (Chunk, changed(CHUNK, bootstrap_offsets=octets(1, 0)), "offset is 0"),
     "negative sequence": (Chunk, changed(CHUNK, sequence=-1), "is negative"),
     "probability 0": (Samples, changed(SAMPLES, probabilities=doubles(0.5, 0)), "not above 0"),
@@ -342,7 +346,7 @@ MALFORMED = {
     "keys a matrix": (
         Priorities,
         changed(PRIORITIES, keys=[[2, 1], b"a" * 16]),
-        "no vectors",
+        "not vectors",
     ),
     "negative new priority": (
         Priorities,
@@ -356,12 +360,12 @@ MALFORMED = {
     ),
     "wish of a long name": (LeaseRequest, changed(WISH, actor="a" * 65), "64 characters"),
     "wish for slot -2": (LeaseRequest, changed(WISH, slot=-2), "slot is below -1"),
-    "wish that holds none": (LeaseRequest, changed(WISH, slot=-1), "names none"),
+    "wish that holds none": (LeaseRequest, changed(WISH, slot=-1), "slot names none"),
     "lease of slot -2": (LeaseReply, changed(LEASE, slot=-2), "slot is below -1"),
-    "rank above the places": (LeaseReply, changed(LEASE, rank=5), "none of 5 places"),
-    "negative rank": (LeaseReply, changed(LEASE, rank=-1), "none of 5 places"),
+    "rank above the places": (LeaseReply, changed(LEASE, rank=5), "not among 5 places"),
+    "negative rank": (LeaseReply, changed(LEASE, rank=-1), "not among 5 places"),
     "lease of no time": (LeaseReply, changed(LEASE, lease_s=0.0), "not above 0"),
-    "lease for ever": (LeaseReply, changed(LEASE, lease_s=np.inf), "finite"),
+    "lease forever": (LeaseReply, changed(LEASE, lease_s=np.inf), "finite"),
     "NaN priority": (Priorities, changed(PRIORITIES, priorities=floats(np.nan, 1)), "not finite"),
 }
 
@@ -387,7 +391,7 @@ def changed_map(message: Any, **fields: Any) -> bytes:
 
 
 MALFORMED |= {
-    "head alone": (Chunk, _PLACES[:6], "ends in its head"),
+    "head alone": (Chunk, _PLACES[:6], "ends within its head"),
     "map cut off": (Chunk, _PLACES[:100], "in a message of 100"),
     "arrays cut off": (Chunk, _PLACES[:-1], r"\[5, 2000\] of uint8 does not fit 9999 bytes"),
     "bytes after the arrays": (Chunk, _PLACES + b"x", "10001 bytes after the map, of which 10000"),
@@ -399,7 +403,7 @@ MALFORMED |= {
     ),
     "another place": (Chunk, _other_place(64), "an array at 64 where 0 is due"),
     "negative place": (Chunk, _other_place(-64), "an array at -64 where 0 is due"),
-    "a place for a name": (Chunk, changed(CHUNK, actor=["a", 0]), "actor: no str"),
+    "a place for a name": (Chunk, changed(CHUNK, actor=["a", 0]), "actor: not of type str"),
 }
 
 
@@ -428,8 +432,8 @@ def test_messages_that_travel_together_come_apart_again(messages: list[Any]) -> 
 
 
 SETS = {
-    "head alone": (b"\xc1set\x02", "ends in its head"),
-    "lengths cut off": (b"\xc1set\x02\0\0\0\x01\0\0\0", "ends in its head"),
+    "head alone": (b"\xc1set\x02", "ends within its head"),
+    "lengths cut off": (b"\xc1set\x02\0\0\0\x01\0\0\0", "ends within its head"),
     "none": (b"\xc1set\0\0\0\0", "a set of 0 messages"),
     "too many": (b"\xc1set\xff\xff\xff\xff", "a set of 4294967295 messages"),
     "cut off": (b"".join(join_set([[b"a"], [b"b"]]))[:-1], "bytes whose messages have"),
@@ -451,7 +455,7 @@ def test_a_random_set_raises_nothing_else(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", MALFORMED)
-def test_the_malformed_is_refused_with_its_reason(name: str) -> None:
+def test_a_malformed_message_is_refused_with_its_reason(name: str) -> None:
     cls, data, reason = MALFORMED[name]
     with pytest.raises(WireError, match=reason) as refused:
         decode(cls, data)
@@ -460,7 +464,7 @@ def test_the_malformed_is_refused_with_its_reason(name: str) -> None:
 
 
 def test_whole_numbers_are_numbers() -> None:
-    """Of a peer in another language, in a pair that is no array too."""
+    """A peer in another language may send them, even in a pair that is not an array."""
     shares = dict.fromkeys(("success_rate", "collision_rate", "timeout_rate"), 0.5)
     rest = {f.name: 1 for f in dataclasses.fields(Evaluation)}
     sent = {**rest, **shares, "schema": "evaluation/1", "worker": "e", "success_interval": [0, 1]}

@@ -25,7 +25,7 @@ def test_what_is_not_marked_is_itself(message: bytes) -> None:
 
 
 DAMAGED = {
-    "head alone": (BLOCK[:6], "ends in its head"),
+    "head alone": (BLOCK[:6], "ends within its head"),
     "too large": (compressed([bytes(LIMIT + 1)]), "10001 bytes exceed the limit of 10000"),
     "cut off": (BLOCK[:-1], "damaged"),
     "noise": (BLOCK[:8] + b"\xff" * 20, "damaged"),

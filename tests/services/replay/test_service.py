@@ -255,7 +255,7 @@ def test_requests_that_wait_are_stored_together_and_answered_each() -> None:
 
 
 REFUSED = {
-    "no message": (b"\x00\x01", "no msgpack|not a map"),
+    "no message": (b"\x00\x01", "not msgpack|not a map"),
     "another message": (encode(Stats("a", "b", {})), "'stats/1' where 'chunk/1'"),
     "another arena": (
         encode(dataclasses.replace(chunk(0), records=np.zeros((LENGTH + 2, 5), np.uint8))),
