@@ -159,7 +159,7 @@ def ordeal(
         "kills": kills + kills // DURING_START,
         "seed": seed,
         "seconds": round(seconds, 1),
-        "ended": (code, "going on from" in last_words),
+        "ended": (code, "continuing from" in last_words),
         "learner_steps": follower.learner_step,
         "published": len(follower.published),
         "epochs": len({weights.epoch for weights in follower.published}),

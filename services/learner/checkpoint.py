@@ -1,11 +1,11 @@
-"""Checkpoints of the learner: folders that are whole or not there.
+"""Checkpoints of the learner: directories that are whole or do not exist.
 
     checkpoints/step_000001234/
         model.safetensors  target.safetensors  optimizer.safetensors  manifest.json
 
-Invariants: a folder gets its name when all in it is on the disk; the manifest holds the digest
-of every file; a reader takes the newest folder whose digests are right and says which it passed
-over; nothing is unpickled. One process writes, any may read.
+Invariants: a directory gets its name once all of its files are on the disk; the manifest holds the
+digest of every file; a reader takes the newest directory whose digests are right and says which
+ones it skipped; nothing is unpickled. One process writes, any may read.
 """
 
 import json
@@ -34,29 +34,29 @@ _FILES = ("model", "target", "optimizer")
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A learner's state, and which weights it had published."""
+    """A learner's state, and the last weights it had published."""
 
     state: LearnerState
     weights_epoch: int
-    weights_version: int  # of the last publication; the next is larger
+    weights_version: int  # of the last publication; the next one is larger
     config_digest: str  # of the configuration it was learned with
     unix_time_s: float  # when it was taken
 
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """The newest whole checkpoint, and why newer ones were passed over."""
+    """The newest whole checkpoint, and why newer ones were skipped."""
 
     checkpoint: Checkpoint
     path: Path
-    passed_over: tuple[str, ...]  # one line each, newest first
+    skipped: tuple[str, ...]  # one line each, newest first
 
 
 def save(directory: Path, checkpoint: Checkpoint, *, keep: int) -> Path:
     """Write a checkpoint below `directory`, then delete all but the newest `keep`.
 
-    Raises CheckpointError if the disk is full or the folder cannot be written; then nothing
-    half-written is left and the older checkpoints are as they were.
+    Raises CheckpointError if the disk is full or the directory cannot be written. Nothing
+    half-written is left then, and the older checkpoints are as they were.
     """
     if keep < 1:
         raise ValueError(f"keep = {keep} would delete the checkpoint just written")
@@ -66,7 +66,7 @@ def save(directory: Path, checkpoint: Checkpoint, *, keep: int) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(directory)
         _write(temporary, checkpoint)
-        if path.exists():  # the same step again; rename cannot replace a folder that holds files
+        if path.exists():  # the same step again; rename cannot replace a directory that holds files
             path.rename(temporary.with_suffix(f".old{TEMPORARY_SUFFIX}"))
         temporary.rename(path)
         sync_directory(directory)
@@ -80,7 +80,7 @@ def save(directory: Path, checkpoint: Checkpoint, *, keep: int) -> Path:
 
 
 def latest(directory: Path) -> Path | None:
-    """The newest checkpoint by its manifest, its other files not yet looked at."""
+    """The newest checkpoint by its manifest; its other files are not checked."""
     found = _newest_first(directory)
     return found[0] if found else None
 
@@ -104,24 +104,28 @@ def load(path: Path) -> Checkpoint:
             unix_time_s=float(manifest["unix_time_s"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"checkpoint {path}: its manifest lacks or spoils {error}") from error
+        raise CheckpointError(
+            f"checkpoint {path}: its manifest lacks {error}, or holds a wrong value"
+        ) from error
 
 
 def load_latest(directory: Path) -> Loaded | None:
     """The newest whole checkpoint; None if there is none at all.
 
-    Raises CheckpointError if there are some and none is whole: whoever asked to go on must not
-    start anew unawares.
+    Raises CheckpointError if there are some and none is whole: a resumed run must not start anew
+    in silence.
     """
     found = _newest_first(directory)
-    passed_over: list[str] = []
+    skipped: list[str] = []
     for path in found:
         try:
-            return Loaded(load(path), path, tuple(passed_over))
+            return Loaded(load(path), path, tuple(skipped))
         except CheckpointError as error:
-            passed_over.append(str(error))
+            skipped.append(str(error))
     if found:
-        raise CheckpointError(f"no checkpoint of {len(found)} is whole; newest: {passed_over[0]}")
+        raise CheckpointError(
+            f"none of {len(found)} checkpoints is whole; the newest: {skipped[0]}"
+        )
     return None
 
 
@@ -146,7 +150,7 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def _remove_leftovers(directory: Path) -> None:
-    """Of saves that were killed."""
+    """Delete what killed saves left behind."""
     for leftover in directory.glob(f".{_PREFIX}*{TEMPORARY_SUFFIX}"):
         shutil.rmtree(leftover)
 

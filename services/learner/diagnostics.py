@@ -22,18 +22,18 @@ from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.step import Update
 
 _LOG = logging.getLogger("learner")
-_STATES = 64  # of a batch that are looked at
+_STATES = 64  # looked at, of a batch
 _TOO_LARGE = 2.0  # times the largest return
 _TOO_DEAD = 0.9
 
-# Between the bins of a histogram, in largest returns
+# edges of histogram bins, in units of the largest return
 _Q_EDGES = np.linspace(-1.0, 1.0, NUM_BINS - 1)
 _TD_ERROR_EDGES = 10.0 ** np.linspace(-4.0, 0.0, NUM_BINS - 1)
 _LOOKS_A_HISTOGRAM = 15
 
 
 class Diagnostics:
-    """Values, errors, units and target of a learner, as its last batch shows them."""
+    """Looks at values, errors, units and target of a learner on its last batch."""
 
     def __init__(self, config: Config, learner: Learner) -> None:
         self._learner = learner
@@ -131,12 +131,12 @@ class Histogram:
         self._counts = np.zeros(len(edges) + 1)
 
     def add(self, values: Float32Array) -> None:
-        """Values that are not numbers are left out."""
+        """Count these values; NaN is left out."""
         bins = np.searchsorted(self._edges, values[~np.isnan(values)], side="right")
         self._counts += np.bincount(bins, minlength=len(self._counts))
 
     def take(self) -> Bins:
-        """The share of each bin in all since the last time; zeros where there were no values."""
+        """The fraction of values in each bin since the last call; zeros where there were none."""
         shares = self._counts / max(self._counts.sum(), 1.0)
         self._counts[:] = 0
         return tuple(float(share) for share in shares)

@@ -86,7 +86,8 @@ class Learner:
 
     def __repr__(self) -> str:
         return (
-            f"Learner(kind={self.agent.kind!r}, device={str(self.device)!r}, step={str(self._step)!r}, "
+            f"Learner(kind={self.agent.kind!r}, device={str(self.device)!r}, "
+            f"step={str(self._step)!r}, "
             f"dtype={self.online.compute_dtype}, learner_step={self.learner_step})"
         )
 

@@ -26,7 +26,7 @@ _POLL_S = 0.2
 
 
 class Prefetcher:
-    """Keeps batches ready."""
+    """Keeps batches ready for the learner."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Prefetcher:
     def next(self, timeout_s: float, most: int = 1) -> list[Batch]:
         """The next batches: `most` or as many as are ready; [] where none is ready in time.
 
-        Raises the error that ended the fetching.
+        Raises the error that ended the thread.
         """
         try:
             batches = [self._ready.get(timeout=timeout_s)]

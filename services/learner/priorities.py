@@ -1,8 +1,8 @@
-"""TD errors on their way back to replay, sent by a thread of its own while the learner computes.
+"""TD errors on their way back to replay, sent by their own thread while the learner computes.
 
 Invariants: the learner never waits for it, not even for the device: `put` takes tensors, and the
-thread reads them; one message is under way at a time; at most `capacity` batches wait, the oldest
-are dropped and counted (harmless: the next draw of a transition brings a newer error).
+thread reads them. One message is under way at a time. At most `capacity` batches wait; the oldest
+are dropped and counted, which is harmless: the next sample of a transition brings a newer error.
 """
 
 import threading
@@ -14,12 +14,12 @@ import torch
 from mrcdrl.common.messages.trajectory import Int64Array, Priorities
 from mrcdrl.services.replay.client import PriorityWriter
 
-_GATHER_S = 0.01  # that a message waits for more batches: it costs more than what is in it
-_GATHER_BATCHES = 16  # are enough
+_GATHER_S = 0.01  # a message waits so long for more batches: it costs more than its content
+_GATHER_BATCHES = 16  # a message with so many does not wait
 
 
 class PrioritiesSender:
-    """Sends absolute TD errors; batches that wait are put together into one message."""
+    """Sends absolute TD errors; batches that wait share one message."""
 
     def __init__(self, writer: PriorityWriter, capacity: int) -> None:
         self._writer = writer
@@ -29,19 +29,19 @@ class PrioritiesSender:
         self._closing = False
         self._error: Exception | None = None
         self.dropped = 0
-        """Batches whose errors never reached replay."""
+        """Number of batches whose errors never reached replay."""
         self._thread = threading.Thread(target=self._run, name="priorities")
         self._thread.start()
 
     @property
     def waiting(self) -> int:
-        """Batches whose errors are not sent yet."""
+        """Number of batches whose errors are not sent yet."""
         return len(self._waiting)
 
     def put(self, keys: Int64Array, td_errors: torch.Tensor) -> None:
-        """TD errors float32 [B], on any device, of the transitions keys int64 [B].
+        """Send TD errors float32 [B], on any device, of the transitions keys int64 [B].
 
-        Raises the error that ended the sending: replay refused, and why.
+        Raises the error that ended the thread, such as a refusal by replay.
         """
         if self._error is not None:
             raise self._error
@@ -54,7 +54,7 @@ class PrioritiesSender:
                 self._changed.notify()
 
     def close(self) -> None:
-        """End the thread after the message under way; what waits is dropped."""
+        """End the thread after the message under way; batches that wait are dropped."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -65,7 +65,7 @@ class PrioritiesSender:
             try:
                 errors = [td_errors.abs().cpu().numpy() for _, td_errors in batches]
                 keys, found = np.concatenate([k for k, _ in batches]), np.concatenate(errors)
-                finite = bool(np.isfinite(found).all())  # else learning diverged, and soon says so
+                finite = bool(np.isfinite(found).all())  # else learning diverged
                 reply = self._writer.update(Priorities(keys, found)) if finite else None
             except Exception as error:  # noqa: BLE001  raised again by put, in the owner's thread
                 self._error = error
@@ -75,7 +75,7 @@ class PrioritiesSender:
                     self.dropped += len(batches)
 
     def _take(self) -> list[tuple[Int64Array, torch.Tensor]] | None:
-        """All that waits, a moment after there is something; None when closing."""
+        """All batches that wait, shortly after the first one arrived; None when closing."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing or self._waiting)
             self._changed.wait_for(

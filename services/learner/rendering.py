@@ -45,7 +45,7 @@ _THREADS = 256  # of the device, for one image
 
 
 class Renderer(Protocol):
-    """How a learner gets its images."""
+    """Turns records into the images that a learner reads."""
 
     def __call__(self, records: UInt8Array, symmetry_rows: SymmetryRows, /) -> Tensor:
         """Images uint8 [B, W, V, V] on the learner's device, of records [B, W, R]."""
@@ -104,7 +104,7 @@ class DeviceRenderer:
     def __init__(
         self, config: ArenaConfig, device: torch.device | str, paint: Paint | None = None
     ) -> None:
-        """paint: instead of the device's own kernel. Raises KernelError where there is none."""
+        """paint: replaces the device's own kernel. Raises KernelError where there is none."""
         self._device = torch.device(device)
         self._paint = paint or _device_paint(config, self._device)
         self._record_bytes = config.record_bytes
@@ -200,7 +200,10 @@ def make_renderer(
 
 
 def to_device(array: NDArray[Any], device: torch.device) -> Tensor:
-    """The array as a tensor there, sharing its memory on the CPU; no copy waits for the device."""
+    """The array as a tensor on the device; no copy waits for the device.
+
+    On the CPU the tensor shares the array's memory.
+    """
     tensor = torch.from_numpy(array)
     if device.type != "cuda":
         return tensor.to(device)

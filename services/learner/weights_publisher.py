@@ -43,7 +43,7 @@ class WeightsPublisher:
         found = checkpoint.load_latest(self._directory)
         if found is None:
             return
-        for reason in found.passed_over:
+        for reason in found.skipped:
             _LOG.warning("%s", reason)
         self._learner.restore(found.checkpoint.state)
         self.epoch = found.checkpoint.weights_epoch

@@ -70,7 +70,7 @@ SETTINGS = {
         ["min_size 50 exceeds capacity 10"],
     ),
     "no such preset": (["train", "--config", "papr"], ["papr", "paper", "quick"]),
-    "resume of nothing": (["train", "--resume", "nothing"], ["nothing", "holds no run"]),
+    "resume of nothing": (["train", "--resume", "nothing"], ["nothing", "is not a run"]),
     "resume with a name": (
         ["train", "--resume", "a", "--name", "b"],
         ["--resume", "--name"],
@@ -167,7 +167,7 @@ def test_no_permission_to_write(tmp_path: Path) -> None:
     file = tmp_path / "a-file"
     file.write_text("", "utf-8")
     for folder in (file / "runs", Path("/proc/runs")):
-        assert "cannot make" in refused(tmp_path, ["train", "--run-dir", folder])
+        assert "cannot create" in refused(tmp_path, ["train", "--run-dir", folder])
 
 
 @pytest.fixture
@@ -241,7 +241,7 @@ def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: P
         end_all(name)
     loaded = checkpoint.load_latest(run / "checkpoints")
     assert loaded is not None
-    assert loaded.passed_over == ()
+    assert loaded.skipped == ()
     assert [path.name for path in run.rglob("*.part")] == []
     assert not (run / "lock").exists()
     assert not (run / "endpoint").exists()

@@ -83,7 +83,7 @@ def test_a_run_leaves_its_files(finished: Finished) -> None:
     assert (config.arena.view_px, config.run.learner_steps) == (32, 60)
     loaded = checkpoint.load_latest(run / "checkpoints")
     assert loaded is not None
-    assert loaded.passed_over == ()
+    assert loaded.skipped == ()
     assert loaded.checkpoint.state.learner_step == 60
     assert (run / "checkpoints" / "best.safetensors").is_file()
     assert list((run / "tensorboard").glob("events.*"))
@@ -128,7 +128,7 @@ def test_resume_goes_on_until_interrupted(finished: Finished, tmp_path: Path) ->
         eventually(lambda: len(read_episodes(run)) > episodes, "episodes appended")
         train.signal(signal.SIGINT)
         assert train.wait() == 0, train.err
-    assert "stopped by hand" in train.err
+    assert "stopping (Ctrl-C) …" in train.err
     assert "Traceback" not in train.err
     no_trace_of(name, run)
     after = summary_of(run)
@@ -136,7 +136,7 @@ def test_resume_goes_on_until_interrupted(finished: Finished, tmp_path: Path) ->
         assert float(str(after[counter])) > float(str(before[counter])), counter
     loaded = checkpoint.load_latest(run / "checkpoints")
     assert loaded is not None
-    assert loaded.passed_over == ()
+    assert loaded.skipped == ()
     assert loaded.checkpoint.state.learner_step == after["learner_steps"]
     assert loaded.checkpoint.weights_version >= int(str(after["weights_version"]))
     steps = [record.learner_steps for record in read_episodes(run)]
@@ -203,7 +203,7 @@ def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: P
             for word in (
                 *("mrcdrl", name, "actors", "replay", "learner", "evaluator", "robot steps"),
                 *("env steps", "learner steps", "samples per insert", "ε", "weights v"),
-                *("successes of the last", "limited by", "evaluation", "left"),
+                *("successes in the last", "bottleneck", "evaluation", "left"),
             ):
                 assert word in terminal.text, word
             mapped = shared_memory_of(name)
@@ -242,7 +242,7 @@ def _kill_and_see_it_back(run: Path, name: str, terminal: Terminal, train: Comma
     terminal.read(lambda: metric(run, "learner_steps") > step + 20, "the learner goes on")
     terminal.read(lambda: metric(run, "weights_version") > version, "newer weights")
     assert train.process.poll() is None
-    terminal.read(lambda: "starting it again" in terminal.text, "word of it on the screen")
+    terminal.read(lambda: "restarting it" in terminal.text, "word of it on the screen")
     found = checkpoint.load_latest(run / "checkpoints")
     assert found is not None
     assert found.checkpoint.state.learner_step > 0

@@ -1,4 +1,4 @@
-"""A checkpoint is whole or not there, whatever befalls the disk or the process."""
+"""A checkpoint is whole or does not exist, whatever befalls the disk or the process."""
 
 import errno
 import json
@@ -49,7 +49,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     assert load(path) == make_checkpoint(1234)
     loaded = load_latest(directory)
     assert loaded is not None
-    assert (loaded.path, loaded.checkpoint, loaded.passed_over) == (path, load(path), ())
+    assert (loaded.path, loaded.checkpoint, loaded.skipped) == (path, load(path), ())
 
 
 def test_the_newest_are_kept(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def remove(path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["model.safetensors", "target.safetensors", "optimizer.safetensors", "manifest.json"]
 )
-def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path, damage, name) -> None:  # type: ignore[no-untyped-def]
+def test_a_damaged_checkpoint_is_skipped_and_named(tmp_path, damage, name) -> None:  # type: ignore[no-untyped-def]
     older = save(tmp_path, make_checkpoint(5), keep=3)
     newer = save(tmp_path, make_checkpoint(10), keep=3)
     damage(newer / name)
@@ -105,14 +105,14 @@ def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path, damage, name) -
     assert loaded.path == older
     assert loaded.checkpoint == make_checkpoint(5)
     if name != "manifest.json":
-        assert len(loaded.passed_over) == 1
-        assert name in loaded.passed_over[0]
+        assert len(loaded.skipped) == 1
+        assert name in loaded.skipped[0]
 
 
 def test_with_damaged_ones_only_nobody_starts_anew_unawares(tmp_path: Path) -> None:
     path = save(tmp_path, make_checkpoint(), keep=3)
     flip(path / "model.safetensors")
-    with pytest.raises(CheckpointError, match="no checkpoint of 1 is whole"):
+    with pytest.raises(CheckpointError, match="none of 1 checkpoints is whole"):
         load_latest(tmp_path)
 
 
@@ -155,7 +155,7 @@ def test_killed_at_any_system_call_the_older_one_is_loaded(
     loaded = load_latest(tmp_path)
     assert loaded is not None
     assert loaded.checkpoint == make_checkpoint(5)
-    assert loaded.passed_over == ()
+    assert loaded.skipped == ()
     save(tmp_path, make_checkpoint(15), keep=3)
     assert names(tmp_path) == ["step_000000005", "step_000000015"], "leftovers are removed"
 

@@ -158,7 +158,7 @@ def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_pat
     assert told[-1]["loss_finite"] == 0
     found = checkpoint.load_latest(tmp_path)
     assert found is not None
-    assert (found.checkpoint.state.learner_step, found.passed_over) == (3, ())
+    assert (found.checkpoint.state.learner_step, found.skipped) == (3, ())
     again = learner_of(config)
     before = published[-1]
     WeightsPublisher(config, again, writer, tmp_path).publish()

@@ -22,7 +22,7 @@ from mrcdrl.services.learner.learner import Learner, LearnerState
 from mrcdrl.services.learner.prefetch import make_collate
 from mrcdrl.services.learner.weights_publisher import WeightsPublisher
 from mrcdrl.services.replay.service import ReplayService
-from tests.services.replay.test_snapshot import insert, save, start
+from tests.services.replay.harness import insert, save, start
 
 BROKEN_OFF, STEPS = 12, 25  # learner steps
 PUBLISH_PERIOD = 5
