@@ -1,10 +1,11 @@
-"""The arena on one core: robot steps a second of physics, of drawing, and of both.
+"""The arena on one core: robot steps per second of physics, of rendering, and of both.
 
-Prints one line of JSON. Each figure is the median of repeats that take turns, so that what else
-runs on the machine falls on all alike; rates are of processor time. `literal`: the paper's steps of
-drawing, the arena once for all of its robots. `collecting`: the shares of an actor's time.
+Prints one line of JSON. Each figure is the median of interleaved repeats, so that other load on the
+machine affects all alike; rates are per second of processor time. `drawing` is rendering, and
+`literal_drawing` the paper's steps of it, the arena once for all of its robots. `collecting` gives
+the shares of an actor's time.
 
-With --pusht-python also gym-pusht, pictures of 60 x 60 a second, in an environment of its own:
+With --pusht-python it also measures gym-pusht in its own environment, images of 60 x 60 per second:
 
     python3 -m venv pusht && pusht/bin/pip install gym-pusht
     python -m benchmarks.arena --pusht-python pusht/bin/python
@@ -33,7 +34,7 @@ PUSHT = Path(__file__).with_name("pusht.py")
 NUM_ACTIONS_DRAWN = 512  # steps after which the random actions repeat
 WARM_UP_CALLS = 20
 
-Measure = Callable[[float], float]  # of the seconds to spend, to the rate
+Measure = Callable[[float], float]  # takes the seconds to spend, returns the rate
 
 
 def main() -> None:
@@ -42,9 +43,9 @@ def main() -> None:
     )
     parser.add_argument("--robots", nargs="+", type=int, default=[2, 3, 4])
     parser.add_argument("--arenas", type=int, default=16, help="stepped together")
-    parser.add_argument("--seconds", type=float, default=1.0, help="of a repeat")
+    parser.add_argument("--seconds", type=float, default=1.0, help="per repeat")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--core", type=int, help="to run on; the first one allowed if not given")
+    parser.add_argument("--core", type=int, help="to run on; default: the first one allowed")
     parser.add_argument("--pusht-python", type=Path, help="a Python that has gym-pusht")
     arguments = parser.parse_args()
     core = min(os.sched_getaffinity(0)) if arguments.core is None else arguments.core
@@ -53,7 +54,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     measures: dict[str, Measure] = {}
     for num_robots in arguments.robots:
-        measures |= of_robots(num_robots, arguments.arenas)
+        measures |= measures_of(num_robots, arguments.arenas)
     rates: dict[str, list[float]] = {}
     with ExitStack() as stack:
         if arguments.pusht_python is not None:
@@ -82,26 +83,26 @@ def main() -> None:
     )
 
 
-def of_robots(num_robots: int, num_arenas: int) -> dict[str, Measure]:
-    """The measures of arenas with so many robots, by their names."""
+def measures_of(num_robots: int, num_arenas: int) -> dict[str, Measure]:
+    """Measures of arenas with this number of robots, by name."""
     config = make_config(num_robots)
     step = stepper(config, num_arenas)
     by_pymunk = make_config(num_robots, physics="pymunk")
-    draw = make_codec(config.arena).decode
+    render = make_codec(config.arena).decode
     records = step()
     robots = num_arenas * num_robots
 
-    def draw_literally(records: UInt8Array) -> None:
+    def render_literally(records: UInt8Array) -> None:
         for scene in scenes_of(records, num_robots):
             literal_views(scene, config.arena)
 
     works: dict[str, Callable[[], object]] = {
         "physics": step,
         "pymunk_physics": stepper(by_pymunk, num_arenas),
-        "drawing": lambda: draw(records),
-        "both": lambda: draw(step()),
-        "literal_drawing": lambda: draw_literally(records),
-        "literal_both": lambda: draw_literally(step()),
+        "drawing": lambda: render(records),
+        "both": lambda: render(step()),
+        "literal_drawing": lambda: render_literally(records),
+        "literal_both": lambda: render_literally(step()),
     }
     return {
         f"{name}_{num_robots}_robot_steps_per_s": rate_of(work, robots)
@@ -115,7 +116,7 @@ def make_config(num_robots: int, physics: str = "array") -> Config:
 
 
 def scenes_of(records: UInt8Array, num_robots: int) -> list[Scene]:
-    """What the first robot of each arena lists."""
+    """Scenes from the records of each arena's first robot."""
     numbers = records.reshape(-1, num_robots, records.shape[-1])[:, 0].copy().view("<f4")
     robots, targets = np.split(numbers.astype(np.float64), [3 * num_robots], axis=1)
     pairs = zip(robots.reshape(-1, num_robots, 3), targets.reshape(-1, num_robots, 2), strict=True)
@@ -123,7 +124,7 @@ def scenes_of(records: UInt8Array, num_robots: int) -> list[Scene]:
 
 
 def stepper(config: Config, num_arenas: int) -> Callable[[], UInt8Array]:
-    """One step by chance of every arena, resets included; gives the records [N, R]."""
+    """A function that steps all arenas at random, with resets, and returns records [N, R]."""
     arenas = ArenaBatch(config.arena, [np.random.default_rng(i) for i in range(num_arenas)])
     shape = (NUM_ACTIONS_DRAWN, num_arenas, config.arena.num_robots)
     drawn = np.random.default_rng(0).integers(0, 3, shape, dtype=np.uint8)
@@ -146,7 +147,7 @@ def stepper(config: Config, num_arenas: int) -> Callable[[], UInt8Array]:
 
 
 def rate_of(work: Callable[[], object], per_call: int) -> Measure:
-    """How often a second of processor time, per_call counted for each call."""
+    """Measures work per second of processor time; each call counts as per_call."""
     for _ in range(WARM_UP_CALLS):
         work()
 
@@ -161,7 +162,7 @@ def rate_of(work: Callable[[], object], per_call: int) -> Measure:
 
 
 def ask(rival: subprocess.Popen[bytes], seconds: float) -> float:
-    """The rival's rate; RuntimeError with what happened if it ended."""
+    """The rival's rate; raises RuntimeError with its exit code if it has ended."""
     if rival.stdin is None or rival.stdout is None:
         raise RuntimeError("the rival has no pipes")
     with suppress(BrokenPipeError):  # no answer will come
@@ -173,7 +174,7 @@ def ask(rival: subprocess.Popen[bytes], seconds: float) -> float:
 
 
 def collecting_shares(num_robots: int, seconds: float) -> dict[str, float]:
-    """Where a collecting actor's time goes, by its own clock; the policy is untrained."""
+    """Shares of a collecting actor's time, by its own clock; the policy is untrained."""
     config = make_config(num_robots)
     collector = make_collector(config)
     epsilons = np.full(config.actor.num_arenas, 0.1, np.float32)

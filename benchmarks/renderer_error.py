@@ -1,8 +1,8 @@
-"""How far the analytic renderer is from the paper's literal steps, in grey levels (0 to 255).
+"""Error of the analytic renderer against the paper's literal steps, in intensity (0 to 255).
 
-Prints one line of JSON: for each size of the rectangle and orientation, over all pixels of all
-robots' pictures in random scenes, the mean absolute error, its mean over the pixels that are not
-black in both, the mean error, and the worst pixel. No time is measured, so load does not matter.
+Prints one line of JSON: for each crop size and orientation, over all pixels of all robots' images
+in random scenes, the mean absolute error, its mean over the pixels that are not black in both, the
+mean error, and the worst pixel. It measures no times, so load does not matter.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import UInt8Array
 
 ORIENTATIONS = ("unrotated", "heading_up")
-LIMIT = 0.5  # grey levels
+LIMIT = 0.5  # of intensity
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--scenes", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--picture", type=Path, help="also draw both side by side, as a PNG")
+    parser.add_argument("--image", type=Path, help="also plot both side by side, as a PNG")
     arguments = parser.parse_args()
     base = {"num_robots": arguments.robots, "target_layout": "random"}
     scenes = random_scenes(ArenaConfig.model_validate(base), arguments.scenes, arguments.seed)
@@ -53,19 +53,19 @@ def main() -> None:
             "errors": rows,
         }
     )
-    if arguments.picture is not None:
-        draw(configs, scenes, arguments.picture)
+    if arguments.image is not None:
+        plot(configs, scenes, arguments.image)
 
 
 def random_scenes(config: ArenaConfig, num: int, seed: int) -> list[Scene]:
-    """Poses and targets by chance, nothing overlapping."""
+    """Draws scenes of poses and targets without overlap."""
     rng = np.random.default_rng(seed)
     starts = [training_start(config, layout_for(config, rng), rng) for _ in range(num)]
     return [Scene(start.robots, start.targets) for start in starts]
 
 
 def error(config: ArenaConfig, scenes: list[Scene]) -> dict[str, object]:
-    """What there is to say of one size and orientation."""
+    """Measures the errors of one crop size and orientation."""
     codec = make_codec(config)
     total = signed = shown = 0
     worst = (-1, {})
@@ -94,8 +94,8 @@ def error(config: ArenaConfig, scenes: list[Scene]) -> dict[str, object]:
     }
 
 
-def draw(configs: list[ArenaConfig], scenes: list[Scene], out: Path) -> None:
-    """A column for each configuration: literal, analytic, and their difference."""
+def plot(configs: list[ArenaConfig], scenes: list[Scene], out: Path) -> None:
+    """Plots a column for each configuration: literal, analytic, and their difference."""
     figure = Figure(figsize=(1.6 * len(configs), 5.2), dpi=110, layout="constrained")
     panels = figure.subplots(3, len(configs), squeeze=False)
     scene, robot = busiest(configs[0], scenes)
@@ -104,20 +104,20 @@ def draw(configs: list[ArenaConfig], scenes: list[Scene], out: Path) -> None:
         codec = make_codec(config)
         analytic = codec.decode(codec.encode(scene))[robot]
         gap = analytic.astype(int) - literal
-        for axes, picture in zip(column, (literal, analytic), strict=False):
-            axes.imshow(picture, cmap="gray", vmin=0, vmax=255)
+        for axes, image in zip(column, (literal, analytic), strict=False):
+            axes.imshow(image, cmap="gray", vmin=0, vmax=255)
         shown = column[2].imshow(gap, cmap="RdBu", vmin=-64, vmax=64)
         for axes in column:
             axes.set(xticks=[], yticks=[])
         column[0].set_title(f"{config.orientation}\n{config.crop_px:g} px", fontsize=8)
     for axes, label in zip(panels[:, 0], ("literal", "analytic", "difference"), strict=True):
         axes.set_ylabel(label)
-    figure.colorbar(shown, ax=panels[2, -1], label="grey levels")
+    figure.colorbar(shown, ax=panels[2, -1], label="intensity")
     figure.savefig(out)
 
 
 def busiest(config: ArenaConfig, scenes: list[Scene]) -> tuple[Scene, int]:
-    """The scene and robot with the most in its picture, of the first hundred scenes."""
+    """The scene and robot with the brightest image, of the first hundred scenes."""
 
     def brightness(views: UInt8Array) -> np.ndarray:
         return views.astype(int).sum(axis=(1, 2))

@@ -1,4 +1,4 @@
-"""Plays an episode by chance through PettingZoo, and writes it as the GIF that is named."""
+"""Plays an episode of random actions through PettingZoo and writes it as the given GIF."""
 
 import sys
 

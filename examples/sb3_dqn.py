@@ -1,4 +1,4 @@
-"""Trains stable-baselines3's DQN on the arena, as both are: one policy shared by all robots.
+"""Trains stable-baselines3's DQN on the arena, both unchanged: all robots share one policy.
 
 `python examples/sb3_dqn.py 2000000` takes hours, and 3 GB for its replay buffer.
 """

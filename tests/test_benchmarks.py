@@ -42,10 +42,10 @@ def test_arena_measures_every_part_and_the_rival(
     rival = program(tmp_path / "python", "while read seconds; do echo 768; done")
     result = printed(monkeypatch, capsys, arena, *BRIEF, "--pusht-python", rival)
     parts = ("physics", "pymunk_physics", "drawing", "both", "literal_drawing", "literal_both")
-    names = {f"{part}_2_robot_steps_per_s" for part in parts} | {"pusht_images_per_s"}
+    names = {f"{part}_2_robot_steps_per_s" for part in parts} | {"pusht_pictures_per_s"}
     assert set(result["rates"]) == names
     assert all(rate["min"] > 0 for rate in result["rates"].values())
-    assert result["rates"]["pusht_images_per_s"]["median"] == 768
+    assert result["rates"]["pusht_pictures_per_s"]["median"] == 768
     (collecting,) = result["collecting"]
     assert sum(s for name, s in collecting.items() if name.endswith("_share")) == pytest.approx(
         1, abs=1e-3

@@ -1,6 +1,6 @@
-"""One arena: an episode after another of K robots that must stand on K targets together.
+"""One arena: episodes of K robots that must all stand on targets at once.
 
-Invariants: those of common.arena.batch, of which it is a batch of one.
+Invariants: those of mrcdrl.common.arena.batch; it is a batch of one.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from mrcdrl.common.messages.trajectory import TimeStep
 
 
 class Arena:
-    """The paper's arena (section 3), in dm_env's terms."""
+    """The paper's arena (section 3), with the interface of dm_env."""
 
     def __init__(
         self,
@@ -22,9 +22,9 @@ class Arena:
         *,
         max_collisions: int | None = None,
     ) -> None:
-        """max_collisions: robot collisions that end an episode; the configuration's if None.
+        """max_collisions: robot collisions that end an episode; config.max_collisions if None.
 
-        Raises ConfigError when robots or targets do not fit.
+        Raises ConfigError if robots or targets do not fit.
         """
         self._batch = ArenaBatch(config, [rng], max_collisions=max_collisions)
 
@@ -33,29 +33,29 @@ class Arena:
 
     @property
     def scene(self) -> Scene:
-        """The true state, a copy."""
+        """A copy of the true state."""
         return self._batch.scene(0)
 
     @property
     def frame(self) -> int:
-        """Frames of this episode so far."""
+        """Frames played in this episode."""
         return int(self._batch.frames[0])
 
     @property
     def collisions(self) -> int:
-        """Robot collisions of this episode: two when two robots run into one another."""
+        """Robot collisions in this episode; two robots that run into each other count as two."""
         return int(self._batch.collisions[0])
 
     def reset(self, start: Start | None = None) -> TimeStep:
-        """Begins an episode, at random or at the given start.
+        """Begins an episode at the given start, or at a random one.
 
-        Raises ValueError for a start with other shapes, or robots that overlap.
+        Raises ValueError if the start has wrong shapes or overlapping robots.
         """
         return self._batch.reset(0, start)
 
     def step(self, actions: ArrayLike) -> TimeStep:
         """Plays one frame; actions: [K] of LEFT, STRAIGHT, RIGHT.
 
-        Raises ValueError for other actions, and when no episode is running.
+        Raises ValueError for invalid actions, or if no episode is running.
         """
         return self._batch.step(np.asarray(actions)[None])[0]

@@ -1,8 +1,8 @@
-"""Many arenas stepped together: episode after episode of K robots that must stand on targets.
+"""Many arenas stepped together, each playing one episode after another.
 
-Invariants: each arena is reset, then stepped until its LAST, then reset; every random number of an
-arena comes from its own generator, so a seed gives the same episodes in every process, whatever
-the other arenas do. Actions are LEFT, STRAIGHT, RIGHT of common.arena.scene.
+Invariants: each arena is reset, stepped until its LAST time step, and reset again. An arena draws
+every random number from its own generator, so a seed gives the same episodes in every process,
+whatever the other arenas do. Actions are LEFT, STRAIGHT and RIGHT of the scene module.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from mrcdrl.common.messages.trajectory import (
 
 
 class ArenaBatch:
-    """The paper's arena (section 3), A times over."""
+    """A copies of the paper's arena (section 3)."""
 
     def __init__(
         self,
@@ -39,13 +39,13 @@ class ArenaBatch:
         *,
         max_collisions: int | None = None,
     ) -> None:
-        """rngs: one an arena. max_collisions: robot collisions that end an episode; the
-        configuration's if None.
+        """rngs: one per arena. max_collisions: robot collisions that end an episode;
+        config.max_collisions if None.
 
-        Raises ConfigError when robots or targets do not fit.
+        Raises ConfigError if robots or targets do not fit.
         """
         if max_collisions is not None and max_collisions < 1:
-            raise ValueError(f"max_collisions {max_collisions} would end episodes unplayed")
+            raise ValueError(f"max_collisions {max_collisions} is not at least 1")
         self._config = config
         self._rngs = rngs
         self._max_collisions = config.max_collisions if max_collisions is None else max_collisions
@@ -56,12 +56,12 @@ class ArenaBatch:
         self._running = np.zeros(len(rngs), np.bool_)
         self._every = np.arange(len(rngs))
         self.frames: Int64Array = np.zeros(len(rngs), np.int64)
-        """Frames of each arena's episode so far [A]."""
+        """Frames played in each arena's episode [A]."""
         self.collisions: Int64Array = np.zeros(len(rngs), np.int64)
-        """Robot collisions of each arena's episode [A]: two when two robots run into one
-        another."""
+        """Robot collisions in each arena's episode [A]; two robots that run into each other
+        count as two."""
         self.failed: BoolArray = np.zeros((len(rngs), config.num_robots), np.bool_)
-        """Robots that stand to the end of their episode [A, K]."""
+        """Robots that stand still until the end of their episode [A, K]."""
         for arena in range(len(rngs)):
             self._place(arena, self._random_start(arena))
 
@@ -69,13 +69,13 @@ class ArenaBatch:
         return len(self._rngs)
 
     def scene(self, arena: int) -> Scene:
-        """The true state of an arena, a copy."""
+        """A copy of the true state of an arena."""
         return self._scenes(np.array(arena))
 
     def reset(self, arena: int, start: Start | None = None) -> TimeStep:
-        """Begins an episode of an arena, at random or at the given start.
+        """Begins an episode of an arena at the given start, or at a random one.
 
-        Raises ValueError for a start with other shapes, or robots that overlap.
+        Raises ValueError if the start has wrong shapes or overlapping robots.
         """
         self._running[arena] = False
         self._place(arena, self._random_start(arena) if start is None else start)
@@ -93,14 +93,14 @@ class ArenaBatch:
         )
 
     def step(self, actions: ArrayLike, arenas: Int64Array | None = None) -> TimeSteps:
-        """Plays one frame in all arenas, or in those of the numbers [N], each named once.
+        """Plays one frame in all arenas, or in the given ones: distinct indices [N].
 
-        actions: [N, K] of LEFT, STRAIGHT, RIGHT. Raises ValueError for other actions, and when an
-        arena has no episode running.
+        actions: [N, K] of LEFT, STRAIGHT, RIGHT. Raises ValueError for invalid actions, or if an
+        arena has no running episode.
         """
         arenas = self._every if arenas is None else arenas
         if not self._running[arenas].all():
-            raise ValueError("the episode has ended or not begun: reset first")
+            raise ValueError("no episode is running: reset first")
         checked = checked_actions(actions, (len(arenas), self._config.num_robots))
         self._fail(arenas)
         failed = self.failed[arenas]
@@ -121,7 +121,7 @@ class ArenaBatch:
         )
 
     def _fail(self, arenas: Int64Array) -> None:
-        """Draws who fails in this frame, except the last robot that works."""
+        """Draws which robots fail in this frame; the last working robot never does."""
         probability = self._config.failure_probability
         for arena in arenas.tolist() if probability else ():
             draws = self._rngs[arena].random(self._config.num_robots)
@@ -131,7 +131,7 @@ class ArenaBatch:
                 self.failed[arena, np.where(working, draws, -1).argmax()] = False
 
     def _scenes(self, arenas: Int64Array) -> Scene:
-        """Of these arenas [...], a copy: its arrays are [..., K, 3] and so on."""
+        """A copy of the state of these arenas [...]; its arrays are [..., K, 3] and so on."""
         return Scene(self._physics.robots[arenas], self._targets[arenas], self._obstacles[arenas])
 
     def _outcomes(self, arenas: Int64Array, success: BoolArray) -> tuple[Outcome | None, ...]:
@@ -152,13 +152,13 @@ class ArenaBatch:
     def _place(self, arena: int, start: Start) -> None:
         config = self._config
         shapes = (start.robots.shape, start.targets.shape, start.obstacles.shape)
-        right = (config.num_robots, 3), (config.target_count, 2), (config.obstacle_count, 3)
-        if shapes != right:
+        expected = (config.num_robots, 3), (config.target_count, 2), (config.obstacle_count, 3)
+        if shapes != expected:
             raise ValueError(
-                f"start has robots, targets and obstacles {shapes}; this arena has {right}"
+                f"start has robots, targets and obstacles {shapes}; this arena has {expected}"
             )
         if not np.isfinite(start.targets).all():
-            raise ValueError(f"start has targets {start.targets.tolist()}")
+            raise ValueError(f"start has targets that are not finite: {start.targets.tolist()}")
         self._physics.place(arena, start.robots, start.obstacles)
         self._targets[arena] = start.targets
         self._obstacles[arena] = start.obstacles
@@ -167,7 +167,7 @@ class ArenaBatch:
 def make_arenas(
     config: ArenaConfig, rngs: Sequence[np.random.Generator], identities: Sequence[int]
 ) -> ArenaBatch | CountingBatch:
-    """The arenas that config.kind names; identities is what counting arenas' images carry."""
+    """The arenas that config.kind names. identities: the numbers in counting arenas' images."""
     if config.kind == "counting":
         return CountingBatch(config, identities)
     return ArenaBatch(config, rngs)

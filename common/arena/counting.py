@@ -1,6 +1,6 @@
-"""An arena whose images say which they are, so that a test proves none is torn or misplaced.
+"""An arena whose images encode counters, so that a test can prove none is torn or misplaced.
 
-Invariants: everything is a function of (identity, episode, step), actions play no part; an image
+Invariants: everything is a function of (identity, episode, step); actions have no effect. An image
 repeats its counters from the first pixel to the last, and a magic byte tells it from an empty one.
 """
 
@@ -30,7 +30,7 @@ _LONGEST = 23
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """What images [..., V, V] say of themselves."""
+    """Counters read from images [..., V, V]."""
 
     identity: Int64Array  # [...]
     robot: Int64Array  # [...]
@@ -39,22 +39,22 @@ class Counters:
 
 
 def counting_frames(identity: int, episode: int) -> int:
-    """Steps of an episode, 1 to 23."""
+    """Number of steps of an episode, 1 to 23."""
     return 1 + (5 * identity + 7 * episode) % _LONGEST
 
 
 def counting_outcome(identity: int, episode: int) -> Outcome:
-    """How an episode ends: terminated (success) and truncated (time-out) by turns."""
+    """Outcome of an episode: alternately terminated (success) and truncated (timeout)."""
     return Outcome.TIMEOUT if (identity + episode) % 2 else Outcome.SUCCESS
 
 
 def counting_reward(episode: int, step: int) -> float:
-    """Reward of every robot for the step that led to this count; exact in float32."""
+    """Reward of every robot for reaching this step; exact in float32."""
     return step + episode % 8 / 8
 
 
 class CountingArena:
-    """The interface of Arena, with counters for images."""
+    """An arena with the interface of Arena and counters as images."""
 
     def __init__(self, config: ArenaConfig, *, identity: int = 0) -> None:
         if not 0 <= identity < 2**16:
@@ -74,20 +74,20 @@ class CountingArena:
 
     @property
     def scene(self) -> Scene:
-        """Robots and targets that stay at the origin."""
+        """A scene whose robots and targets stay at the origin."""
         return Scene(np.zeros((self._num_robots, 3)), np.zeros((self._num_robots, 2)))
 
     def reset(self, start: Start | None = None) -> TimeStep:
-        """Begins the next episode; a start is taken and plays no part."""
+        """Begins the next episode and ignores the start."""
         self._episode += 1
         self._running = True
         self.frame = 0
         return self._time_step(StepType.FIRST, 0.0, None)
 
     def step(self, actions: ArrayLike) -> TimeStep:
-        """Counts on; actions: [K], checked as Arena does."""
+        """Counts one step; actions: [K], checked as Arena does."""
         if not self._running:
-            raise ValueError("the episode has ended or not begun: reset first")
+            raise ValueError("no episode is running: reset first")
         checked_actions(actions, (self._num_robots,))
         self.frame += 1
         reward = counting_reward(self._episode, self.frame)
@@ -109,7 +109,7 @@ class CountingArena:
         )
 
     def _records(self) -> UInt8Array:
-        """Records [K, V * V] of the present count."""
+        """Records [K, V * V] with the current counters."""
         counters = np.zeros(self._num_robots, _COUNTERS)
         counters["magic"] = _MAGIC
         counters["robot"] = np.arange(self._num_robots)
@@ -122,10 +122,10 @@ class CountingArena:
 
 
 class CountingBatch:
-    """The interface of ArenaBatch, over counting arenas."""
+    """Counting arenas with the interface of ArenaBatch."""
 
     def __init__(self, config: ArenaConfig, identities: Sequence[int]) -> None:
-        """identities: one an arena."""
+        """identities: one per arena."""
         self._arenas = [CountingArena(config, identity=identity) for identity in identities]
 
     def __len__(self) -> int:
@@ -136,7 +136,7 @@ class CountingBatch:
         return self._arenas[arena].reset(start)
 
     def step(self, actions: ArrayLike) -> TimeSteps:
-        """Counts on in all arenas; actions: [A, K]."""
+        """Counts one step in all arenas; actions: [A, K]."""
         pairs = zip(self._arenas, np.asarray(actions), strict=True)
         steps = [arena.step(own) for arena, own in pairs]
         return TimeSteps(
@@ -149,7 +149,7 @@ class CountingBatch:
 
 
 def decode_counters(images: UInt8Array) -> Counters:
-    """The counters of images [..., V, V]; raises ValueError if one contradicts itself."""
+    """Reads the counters of images [..., V, V]; raises ValueError if any image is torn."""
     leading = images.shape[:-2]
     pixels = np.ascontiguousarray(images).reshape(-1, images.shape[-2] * images.shape[-1])
     marks = np.ascontiguousarray(pixels[:, : _COUNTERS.itemsize])
@@ -158,7 +158,7 @@ def decode_counters(images: UInt8Array) -> Counters:
     counters = marks.view(_COUNTERS)[:, 0]
     torn = ~whole | (counters["magic"] != _MAGIC)
     if torn.any():
-        raise ValueError(f"{int(torn.sum())} of {len(torn)} images are torn or none of ours")
+        raise ValueError(f"{int(torn.sum())} of {len(torn)} images are torn or hold no counters")
 
     def field(name: str) -> Int64Array:
         return counters[name].astype(np.int64).reshape(leading)

@@ -1,8 +1,8 @@
-"""Players that see the true state: to exercise the arena and to compare learned ones with.
+"""Controllers that see the true state, to exercise the arena and to compare learned policies with.
 
-Invariants: a controller plays one episode, and is called with each of its scenes in turn, so that
-it may remember; every random number comes from the injected generator. All see the scene itself,
-which the paper's agents never do: say so wherever one stands beside a learned policy.
+Invariants: a controller plays one episode and is called with each of its scenes in order, so that
+it may keep state; every random number comes from the injected generator. All see the scene itself,
+which the paper's agents never do: say so wherever one is compared with a learned policy.
 """
 
 import difflib
@@ -24,41 +24,41 @@ __all__ = [
     "PotentialField",
     "SafeCircle",
     "check_controller",
-    "controller",
     "greedy_actions",
+    "make_controller",
     "random_actions",
     "shortest_assignment",
 ]
 
 CONTROLLERS = ("random", "greedy", "potential_field", "orca", "safe_circle")
-"""Names that `controller` takes."""
-_OPEN_FIELD = ("orca", "safe_circle")  # know of nothing that stands between the walls
+"""Names that `make_controller` accepts."""
+_OPEN_FIELD = ("orca", "safe_circle")  # expect nothing between the outer walls
 
 
 def check_controller(name: str) -> str:
-    """The name; raises ConfigError, with the nearest right one, where nothing is called so."""
+    """Returns the name; raises ConfigError with the closest match if it is unknown."""
     if name in CONTROLLERS:
         return name
     near = difflib.get_close_matches(name, CONTROLLERS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(CONTROLLERS)}"
+    hint = f"did you mean {near[0]}?" if near else f"choose from {', '.join(CONTROLLERS)}"
     raise ConfigError(f"unknown controller {name!r}; {hint}")
 
 
-def controller(name: str, config: ArenaConfig, rng: np.random.Generator) -> Controller:
-    """A new controller for one episode.
+def make_controller(name: str, config: ArenaConfig, rng: np.random.Generator) -> Controller:
+    """Makes a controller for one episode.
 
-    Raises ConfigError for an unknown name, and for a world that the controller cannot play in.
+    Raises ConfigError for an unknown name, or if the controller does not support the world.
     """
     check_controller(name)
     if name in _OPEN_FIELD and (config.obstacle_count or config.inner_walls_px):
         raise ConfigError(
-            f"controller {name!r} knows of no obstacles and inner walls; "
-            "take potential_field, greedy or random"
+            f"controller {name!r} does not support obstacles or inner walls; "
+            "use potential_field, greedy or random"
         )
     if name == "safe_circle" and config.failure_probability:
         raise ConfigError(
-            "controller 'safe_circle' counts on all robots to circle on; where they may fail take "
-            "orca, potential_field, greedy or random"
+            "controller 'safe_circle' does not support robots that fail; "
+            "use orca, potential_field, greedy or random"
         )
     match name:
         case "greedy":

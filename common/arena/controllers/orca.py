@@ -1,11 +1,11 @@
 """Hungarian assignment and optimal reciprocal collision avoidance (van den Berg et al. 2011).
 
-ORCA chooses velocities, of which a robot here has few: the chosen one is mapped onto the action
-that turns nearest to it, and onto a circle where it is slow. A robot's disc is enlarged by the way
-it swerves while it does so.
+ORCA chooses a velocity, but a robot here has few actions: the velocity is mapped to the action that
+turns closest to it, or to a circle if it is slow. A robot's disc is enlarged by how far it swerves
+on that circle.
 
-Invariants: sees the true state, which the paper's agents do not; the assignment of the episode's
-first scene is kept; velocities are px a frame.
+Invariants: the controller sees the true state, which the paper's agents do not; it keeps the
+assignment of the episode's first scene. Velocities are in px per frame.
 """
 
 import math
@@ -24,13 +24,13 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Float64Array, Int64Array, UInt8Array
 
 _HORIZON_FRAMES = 30.0  # tau: collisions sooner than this are avoided
-_SLOW = 0.5  # share of the speed below which a velocity is answered by a circle
-_EASE = 0.2  # px a frame of preferred speed for each px to the target, near it
-_SPEEDS, _HEADINGS = 8, 64  # velocities tried beside the preferred one
+_SLOW = 0.5  # fraction of the speed below which the robot circles instead
+_EASE = 0.2  # preferred speed near the target, px per frame for each px of distance
+_SPEEDS, _HEADINGS = 8, 64  # velocities tried besides the preferred one
 
 
 class Orca:
-    """Of the velocities v in all half-planes n . v >= bound, the nearest to the preferred one."""
+    """Chooses the velocity v nearest to the preferred one in all half-planes n . v >= bound."""
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
@@ -44,7 +44,7 @@ class Orca:
         self._velocities = np.zeros((config.num_robots, 2))
 
     def __call__(self, scene: Scene) -> UInt8Array:
-        """Actions [K]."""
+        """Chooses actions [K]."""
         if self._assignment is None:
             self._assignment = shortest_assignment(scene)
         places = scene.robots[:, :2]
@@ -55,7 +55,7 @@ class Orca:
         return np.where(speeds < _SLOW * self._config.step_px, np.uint8(LEFT), towards)
 
     def _wishes(self, aims: Float64Array) -> Float64Array:
-        """Preferred velocities [K, 2]: straight to the target, slower on it."""
+        """Preferred velocities [K, 2]: straight to the target, slower near it."""
         distances = np.linalg.norm(aims, axis=1, keepdims=True)
         wishes: Float64Array = aims * np.minimum(
             self._config.step_px / np.maximum(distances, 1e-9), _EASE
@@ -63,7 +63,7 @@ class Orca:
         return wishes
 
     def _half_planes(self, places: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Normals [K, N, 2] and bounds [K, N] of each robot, for the others and the walls."""
+        """Each robot's normals [K, N, 2] and bounds [K, N], from the other robots and the walls."""
         num = len(places)
         others = np.nonzero(~np.eye(num, dtype=bool))[1].reshape(num, num - 1)
         normals, bounds = self._from_robots(
@@ -81,20 +81,21 @@ class Orca:
     def _from_robots(
         self, apart: Float64Array, own: Float64Array, velocities: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Of others at `apart` [K, K - 1, 2]: each side takes half of the least change that avoids.
+        """Half-planes from the others at `apart` [K, K - 1, 2].
 
-        own: velocities [K, 1, 2].
+        Each side makes half of the least change that avoids a collision. own: velocities
+        [K, 1, 2].
         """
         relative = own - velocities
         reach = 2 * self._radius
         distances = np.linalg.norm(apart, axis=2)
         overlap = distances <= reach
-        # The cut-off disc: of the velocities that touch within the horizon, or at once if they do.
+        # The cut-off disc: velocities that touch within the horizon, or now if they overlap.
         horizon = np.where(overlap, 1.0, _HORIZON_FRAMES)[..., None]
         from_disc = relative - apart / horizon
-        disc_way = np.linalg.norm(from_disc, axis=2, keepdims=True)
-        disc_normal = from_disc / np.maximum(disc_way, 1e-9)
-        disc_change = (reach / horizon - disc_way) * disc_normal
+        disc_distance = np.linalg.norm(from_disc, axis=2, keepdims=True)
+        disc_normal = from_disc / np.maximum(disc_distance, 1e-9)
+        disc_change = (reach / horizon - disc_distance) * disc_normal
         # The legs of the cone, on the side where the relative velocity lies.
         side = np.where(_cross(apart, from_disc) > 0, 1.0, -1.0)
         bearing = bearings_rad(apart)
@@ -103,7 +104,7 @@ class Orca:
         leg_normal = side[..., None] * np.stack([-leg[..., 1], leg[..., 0]], axis=-1)
         leg_change = (relative * leg).sum(axis=2, keepdims=True) * leg - relative
         along = (from_disc * apart).sum(axis=2)
-        on_disc = overlap | ((along < 0) & (along**2 > (reach * disc_way[..., 0]) ** 2))
+        on_disc = overlap | ((along < 0) & (along**2 > (reach * disc_distance[..., 0]) ** 2))
         normals = np.where(on_disc[..., None], disc_normal, leg_normal)
         changes = np.where(on_disc[..., None], disc_change, leg_change)
         bounds = (normals * (own + changes / 2)).sum(axis=2)
@@ -112,15 +113,15 @@ class Orca:
     def _nearest(
         self, wishes: Float64Array, normals: Float64Array, bounds: Float64Array
     ) -> Float64Array:
-        """Of the velocities tried that break the half-planes least, the nearest to the wish."""
+        """Chooses, among the tried velocities that violate the least, the nearest to the wish."""
         num = len(wishes)
         tried = np.concatenate(
             [wishes[:, None], np.broadcast_to(self._tried, (num, *self._tried.shape))], axis=1
         )
-        broken = (bounds[:, :, None] - normals @ tried.transpose(0, 2, 1)).max(axis=1)
-        broken = np.round(np.maximum(broken, 0), 3)
+        violation = (bounds[:, :, None] - normals @ tried.transpose(0, 2, 1)).max(axis=1)
+        violation = np.round(np.maximum(violation, 0), 3)
         away = np.linalg.norm(tried - wishes[:, None], axis=2)
-        away[broken > broken.min(axis=1, keepdims=True)] = np.inf
+        away[violation > violation.min(axis=1, keepdims=True)] = np.inf
         nearest: Float64Array = tried[np.arange(num), away.argmin(axis=1)]
         return nearest
 

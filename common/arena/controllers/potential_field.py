@@ -1,7 +1,7 @@
 """Hungarian assignment and a potential field (Khatib 1986).
 
-Invariants: sees the true state, which the paper's agents do not; the assignment of the episode's
-first scene is kept.
+Invariants: the controller sees the true state, which the paper's agents do not; it keeps the
+assignment of the episode's first scene.
 """
 
 import numpy as np
@@ -11,26 +11,26 @@ from mrcdrl.common.arena.controllers.heading import (
     bearings_rad,
     shortest_assignment,
 )
-from mrcdrl.common.arena.world.obstacles import reachable_px, ways_from
+from mrcdrl.common.arena.world.obstacles import offsets_from, reachable_px
 from mrcdrl.common.arena.world.scene import Scene
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Float64Array, Int64Array, UInt8Array
 
 _ROBOTS_FROM_PX = 60.0  # gap between two robots below which they repel each other
 _WALLS_FROM_PX = 15.0  # gap between a robot and a wall below which it is repelled
-_REPULSION = 1.0  # of the attraction, at half the gap
-_LEAST_PX = 1.0  # a smaller gap repels no more than this
+_REPULSION = 1.0  # relative to the attraction, at half the gap
+_LEAST_PX = 1.0  # a smaller gap repels no more than this one
 
 
 class PotentialField:
-    """Each robot is drawn to its target, and pushed off by whatever is near."""
+    """Attracts each robot to its target and repels it from everything near."""
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
         self._assignment: Int64Array | None = None
 
     def __call__(self, scene: Scene) -> UInt8Array:
-        """Actions [K] along the force on each robot."""
+        """Chooses actions [K] along the force on each robot."""
         if self._assignment is None:
             self._assignment = shortest_assignment(scene)
         places = scene.robots[:, :2]
@@ -42,7 +42,7 @@ class PotentialField:
         return actions_towards(scene.robots[:, 2], bearings_rad(forces), self._config)
 
     def _from_robots(self, places: Float64Array) -> Float64Array:
-        """Push [K, 2] by the other robots."""
+        """Repulsion [K, 2] from the other robots."""
         apart = places[:, None] - places[None]
         distances = np.linalg.norm(apart, axis=2)
         np.fill_diagonal(distances, np.inf)
@@ -53,7 +53,7 @@ class PotentialField:
         return push
 
     def _from_walls(self, places: Float64Array) -> Float64Array:
-        """Push [K, 2] by the four walls."""
+        """Repulsion [K, 2] from the four outer walls."""
         low, high = reachable_px(self._config)
         near, far = (
             _strength(places - low, _WALLS_FROM_PX),
@@ -62,13 +62,13 @@ class PotentialField:
         return near - far
 
     def _from_obstacles(self, places: Float64Array, obstacles: Float64Array) -> Float64Array:
-        """Push [K, 2] by obstacles and inner walls."""
-        ways, widths = ways_from(self._config, places, obstacles)
-        distances = np.linalg.norm(ways, axis=2)
+        """Repulsion [K, 2] from obstacles and inner walls."""
+        offsets, widths = offsets_from(self._config, places, obstacles)
+        distances = np.linalg.norm(offsets, axis=2)
         gaps = distances - widths - self._config.robot_radius_px
-        push: Float64Array = ((_strength(gaps, _WALLS_FROM_PX) / distances)[..., None] * ways).sum(
-            axis=1
-        )
+        push: Float64Array = (
+            (_strength(gaps, _WALLS_FROM_PX) / distances)[..., None] * offsets
+        ).sum(axis=1)
         return push
 
 

@@ -1,7 +1,7 @@
-"""The arena as a PettingZoo ParallelEnv: every robot an agent that sees its own images.
+"""The arena as a PettingZoo ParallelEnv; every robot is an agent that sees its own images.
 
-Invariants: all robots live through the whole episode; success and too many collisions terminate it,
-the time limit truncates it. The same seed and actions give the same episodes in every process.
+Invariants: all robots live until the end of the episode. Success and too many collisions terminate
+it; the time limit truncates it. The same seed and actions give the same episodes in every process.
 """
 
 import sys
@@ -17,17 +17,19 @@ from mrcdrl.common.arena.envs.stacked import StackedArenas
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Outcome, TimeStep, UInt8Array
 
-_TERMINAL_PX = 48  # rows of the image in a terminal; two of them share a line of text
+_TERMINAL_PX = 48  # rows of the image in a terminal; a line of text shows two of them
 _ONLY = np.array([0])  # the one arena
 
 Infos = dict[str, dict[str, Any]]
 
 
 class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
-    """Observations uint8 [stack, V, V]; actions 0 left, 1 straight, 2 right, all of which move on.
+    """PettingZoo environment of one arena.
 
-    infos of an agent: `collided`, whether its move of this frame was undone; `hit_wall`, whether by
-    a wall; `outcome`, at the end "success", "collision" or "timeout", else None.
+    Observations: uint8 [stack, V, V]. Actions: 0 left, 1 straight, 2 right; all move forward.
+    infos of an agent: `collided`, whether its move of this frame was undone; `hit_wall`, whether a
+    wall or an obstacle did so; `outcome`, at the end "success", "collision" or "timeout", else
+    None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -44,14 +46,14 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         max_cycles: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """max_cycles: frames of an episode, instead of config.max_frames.
+        """max_cycles: frames of an episode; config.max_frames if None.
 
-        render_mode: `rgb_array`, an image where render() is called; `human`, drawn in the terminal
-        after each step, because the OpenCV we need has no windows. Raises ConfigError when robots
-        or targets do not fit, ValueError for another mode or length.
+        render_mode: `rgb_array`, render() returns an image; `human`, rendered in the terminal after
+        each step, because our OpenCV has no window system. Raises ConfigError if robots or targets
+        do not fit, ValueError for another mode or length.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode {render_mode!r}: there are human and rgb_array")
+            raise ValueError(f"render_mode {render_mode!r} is not human or rgb_array")
         config = config or ArenaConfig()
         if max_cycles is not None:
             config = ArenaConfig.model_validate({**config.model_dump(), "max_frames": max_cycles})
@@ -65,7 +67,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         self.action_spaces = {agent: Discrete(NUM_ACTIONS) for agent in self.possible_agents}
         self._config = config
         self._arenas = StackedArenas(config, [np.random.default_rng()])
-        self._drawn = False
+        self._rendered = False
 
     def observation_space(self, agent: str) -> Box:
         return self.observation_spaces[agent]
@@ -76,16 +78,16 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, UInt8Array], Infos]:
-        """Begins an episode. seed: of this one and all that follow, till the next seed.
+        """Begins an episode. seed: for this episode and all that follow, until the next seed.
 
         options: {"start": Start} to begin there, such as one of `test_starts`; other names are
-        let be.
+        ignored.
         """
         if seed is not None:
             self._arenas = StackedArenas(self._config, [np.random.default_rng(seed)])
         time_step = self._arenas.reset(0, (options or {}).get("start"))
         self.agents = self.possible_agents[:]
-        self._draw_for_people()
+        self._render_in_terminal()
         return self._observations(), self._infos(time_step)
 
     def step(
@@ -93,7 +95,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
     ) -> tuple[dict[str, UInt8Array], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Plays one frame with an action for every agent; five empty dicts after the end.
 
-        Raises ValueError where an agent has no action, or another than 0, 1, 2.
+        Raises ValueError if an agent has no action or one other than 0, 1, 2.
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
@@ -107,7 +109,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         terminated = time_step.last and not truncated
         if time_step.last:
             self.agents = []
-        self._draw_for_people()
+        self._render_in_terminal()
         return (
             self._observations(),
             dict(zip(agents, time_step.rewards.tolist(), strict=True)),
@@ -117,11 +119,11 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         )
 
     def render(self) -> UInt8Array | None:
-        """The arena as RGB [600, 600, 3] in the mode rgb_array, else None."""
+        """Renders the arena as RGB [600, 600, 3] in the mode rgb_array; else returns None."""
         return self._arenas.image(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Does nothing; there is nothing to close."""
 
     def _observations(self) -> dict[str, UInt8Array]:
         return dict(zip(self.possible_agents, self._arenas.states[0].copy(), strict=True))
@@ -134,18 +136,18 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
             for agent, (collided, hit_wall) in zip(self.possible_agents, hits, strict=True)
         }
 
-    def _draw_for_people(self) -> None:
-        """In the mode human: over the image before."""
+    def _render_in_terminal(self) -> None:
+        """Overwrites the previous image in the terminal, in the mode human."""
         if self.render_mode == "human":
-            back = f"\x1b[{_TERMINAL_PX // 2}A" if self._drawn else ""
+            back = f"\x1b[{_TERMINAL_PX // 2}A" if self._rendered else ""
             image = self._arenas.image(0, _TERMINAL_PX, smooth=False)
             sys.stdout.write(back + terminal_image(image))
             sys.stdout.flush()
-            self._drawn = True
+            self._rendered = True
 
 
 def terminal_image(image: UInt8Array) -> str:
-    """An RGB image [H, W, 3] as H / 2 lines of half blocks in 24-bit colour."""
+    """Encodes an RGB image [H, W, 3] as H / 2 lines of half blocks in 24-bit colour."""
     lines = []
     for upper, lower in zip(image[::2].tolist(), image[1::2].tolist(), strict=True):
         blocks = (
@@ -162,7 +164,7 @@ def parallel_env(
     max_cycles: int | None = None,
     render_mode: str | None = None,
 ) -> ArenaParallelEnv:
-    """The environment, by the name under which PettingZoo's users look for it."""
+    """Makes the environment, under the name that PettingZoo's users expect."""
     return ArenaParallelEnv(config, max_cycles=max_cycles, render_mode=render_mode)
 
 
@@ -172,6 +174,6 @@ def env(
     max_cycles: int | None = None,
     render_mode: str | None = None,
 ) -> AECEnv:
-    """The same, one robot at a time (PettingZoo's AEC form)."""
+    """Makes the environment that plays one robot at a time (PettingZoo's AEC form)."""
     parallel = parallel_env(config, max_cycles=max_cycles, render_mode=render_mode)
     return wrappers.OrderEnforcingWrapper(parallel_to_aec(parallel))

@@ -1,6 +1,6 @@
-"""The arena as stable-baselines3's VecEnv for one shared policy: every robot is a sub-environment.
+"""The arena as stable-baselines3's VecEnv for one shared policy; every robot is a sub-environment.
 
-Invariants: the robots of an arena lie side by side and end together; the step that ends an episode
+Invariants: the robots of an arena are adjacent and end together. The step that ends an episode
 returns the first states of the next one, and the last of the old one as `terminal_observation`.
 """
 
@@ -17,10 +17,11 @@ from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, UInt8Arra
 
 
 class ArenaVecEnv(VecEnv):  # type: ignore[misc]
-    """Observations uint8 [N, stack, V, V]; actions [N] of 0 left, 1 straight, 2 right.
+    """Vector environment whose N robots fill several arenas.
 
-    infos of a robot: those of ArenaParallelEnv; at an end also `terminal_observation` and
-    `TimeLimit.truncated`, as stable-baselines3 wants them.
+    Observations: uint8 [N, stack, V, V]. Actions: [N] of 0 left, 1 straight, 2 right. infos of a
+    robot: those of ArenaParallelEnv, and at an end `terminal_observation` and
+    `TimeLimit.truncated`, as stable-baselines3 expects.
     """
 
     def __init__(
@@ -30,9 +31,9 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         *,
         render_mode: str | None = None,
     ) -> None:
-        """Raises ConfigError when robots or targets do not fit, ValueError for another mode."""
+        """Raises ConfigError if robots or targets do not fit, ValueError for an unknown mode."""
         if num_arenas < 1:
-            raise ValueError(f"num_arenas {num_arenas}: at least 1")
+            raise ValueError(f"num_arenas {num_arenas} is not at least 1")
         self._arenas = [
             ArenaParallelEnv(config, render_mode=render_mode) for _ in range(num_arenas)
         ]
@@ -46,7 +47,7 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         )
 
     def reset(self) -> UInt8Array:
-        """Begins an episode everywhere; by the seeds given to `seed`, the first time after it."""
+        """Begins an episode in every arena; uses the seeds given to `seed` once."""
         states: list[UInt8Array] = []
         for number, arena in enumerate(self._arenas):
             observations, _ = arena.reset(self._seeds[number * len(self._agents)])
@@ -60,42 +61,42 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         self._actions = [dict(zip(self._agents, own, strict=True)) for own in by_arena]
 
     def step_wait(self) -> tuple[UInt8Array, Float32Array, BoolArray, list[dict[str, Any]]]:
-        """Plays one frame everywhere, and begins an episode where one ended."""
+        """Plays one frame in every arena, and begins an episode where one ended."""
         states: list[UInt8Array] = []
         rewards: list[float] = []
         ends: list[bool] = []
         infos: list[dict[str, Any]] = []
         for arena, actions in zip(self._arenas, self._actions, strict=True):
-            observations, paid, terminated, truncated, told = arena.step(actions)
+            observations, paid, terminated, truncated, arena_infos = arena.step(actions)
             rewards += paid.values()
-            infos += told.values()
+            infos += arena_infos.values()
             ended = not arena.agents
             if ended:
-                for agent, last in observations.items():
-                    told[agent]["terminal_observation"] = last
-                    told[agent]["TimeLimit.truncated"] = truncated[agent] and not terminated[agent]
+                for agent, info in arena_infos.items():
+                    info["terminal_observation"] = observations[agent]
+                    info["TimeLimit.truncated"] = truncated[agent] and not terminated[agent]
                 observations, _ = arena.reset()
             states += observations.values()
             ends += [ended] * len(self._agents)
         return np.stack(states), np.array(rewards, np.float32), np.array(ends), infos
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Does nothing; there is nothing to close."""
 
     def get_images(self) -> Sequence[UInt8Array | None]:
-        """Each robot's arena as RGB [600, 600, 3]; None in other modes than rgb_array."""
+        """Renders each robot's arena as RGB [600, 600, 3]; None unless the mode is rgb_array."""
         images = [arena.render() for arena in self._arenas]
         return [image for image in images for _ in self._agents]
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """An attribute of each robot's arena."""
-        return [getattr(arena, attr_name) for arena in self._of(indices)]
+        """Reads an attribute of each robot's arena."""
+        return [getattr(arena, attr_name) for arena in self._arenas_of(indices)]
 
     def set_attr(
         self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None
     ) -> None:
         """Sets an attribute of each robot's arena."""
-        for arena in self._of(indices):
+        for arena in self._arenas_of(indices):
             setattr(arena, attr_name, value)
 
     def env_method(
@@ -108,15 +109,15 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         """Calls a method of each robot's arena."""
         return [
             getattr(arena, method_name)(*method_args, **method_kwargs)
-            for arena in self._of(indices)
+            for arena in self._arenas_of(indices)
         ]
 
     def env_is_wrapped(
         self, wrapper_class: type, indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """No robot's arena is."""
-        return [isinstance(arena, wrapper_class) for arena in self._of(indices)]
+        """Returns False for every robot; no arena is wrapped."""
+        return [isinstance(arena, wrapper_class) for arena in self._arenas_of(indices)]
 
-    def _of(self, indices: int | Iterable[int] | None) -> list[ArenaParallelEnv]:
-        """The arenas of these robots, of all if None."""
+    def _arenas_of(self, indices: int | Iterable[int] | None) -> list[ArenaParallelEnv]:
+        """The arenas of these robots, or of all robots if None."""
         return [self._arenas[robot // len(self._agents)] for robot in self._get_indices(indices)]

@@ -1,7 +1,7 @@
-"""Arenas whose robots' states are images, stacked as the paper's network gets them.
+"""Arenas whose robots' states are stacked images, as the paper's network takes them.
 
-Invariants: a state is the newest `stack` images, oldest first; at an episode's start the first
-one is repeated (paper section 4).
+Invariants: a state is the newest `stack` images, oldest first; at the start of an episode the first
+image is repeated (paper section 4).
 """
 
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ from mrcdrl.common.messages.trajectory import Int64Array, TimeStep, TimeSteps, U
 
 
 class StackedArenas:
-    """What the environments of PettingZoo and Gymnasium have in common."""
+    """Common core of the PettingZoo and Gymnasium environments."""
 
     def __init__(self, config: ArenaConfig, rngs: Sequence[np.random.Generator]) -> None:
-        """rngs: one an arena. Raises ConfigError when robots or targets do not fit."""
+        """rngs: one per arena. Raises ConfigError if robots or targets do not fit."""
         self._config = config
         self._arenas = ArenaBatch(config, rngs)
         self._codec = make_codec(config)
         shape = (len(rngs), config.num_robots, config.stack, config.view_px, config.view_px)
         self.states: UInt8Array = np.zeros(shape, np.uint8)
-        """Of the last time step, [A, K, S, V, V]; written over by the next."""
+        """States after the last time step [A, K, S, V, V]; the next step overwrites them."""
 
     def reset(self, arena: int, start: Start | None = None) -> TimeStep:
         """Begins an episode of an arena, as ArenaBatch does."""
@@ -43,6 +43,6 @@ class StackedArenas:
         return time_steps
 
     def image(self, arena: int, size_px: int = 600, *, smooth: bool = True) -> UInt8Array:
-        """A whole arena as RGB [size_px, size_px, 3], for people to look at."""
+        """Renders a whole arena as RGB [size_px, size_px, 3], for people to look at."""
         bgr = render_arena(self._arenas.scene(arena), self._config, size_px, smooth=smooth)
         return np.ascontiguousarray(bgr[..., ::-1])

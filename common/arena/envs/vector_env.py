@@ -1,7 +1,7 @@
-"""The arena as a Gymnasium VectorEnv for one shared policy: every robot is a sub-environment.
+"""The arena as a Gymnasium VectorEnv for one shared policy; every robot is a sub-environment.
 
-Invariants: the robots of an arena lie side by side and end together, because they share its
-episode; the step after an end resets that arena, takes no notice of its actions and pays nothing
+Invariants: the robots of an arena are adjacent and end together, because they share its episode.
+The step after an end resets that arena, ignores its actions and gives reward 0
 (AutoresetMode.NEXT_STEP). The same seed and actions give the same episodes in every process.
 """
 
@@ -30,10 +30,11 @@ ENV_ID = "mrcdrl/Arena-v0"
 
 
 class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
-    """Observations uint8 [N, stack, V, V]; actions [N] of 0 left, 1 straight, 2 right.
+    """Vector environment whose N robots fill several arenas.
 
-    infos, each with a mask of the same name after an underscore: `collided` and `hit_wall`, bool
-    [N]; `outcome`, object [N], "success", "collision" or "timeout" at an end, else None.
+    Observations: uint8 [N, stack, V, V]. Actions: [N] of 0 left, 1 straight, 2 right. infos, each
+    with a mask of the same name after an underscore: `collided` and `hit_wall`, bool [N];
+    `outcome`, object [N], "success", "collision" or "timeout" at an end, else None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
@@ -50,19 +51,19 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         *,
         render_mode: str | None = None,
     ) -> None:
-        """num_envs: robots of all arenas together; one arena's if None.
+        """num_envs: robots of all arenas together; the robots of one arena if None.
 
-        Raises ConfigError when robots or targets do not fit, ValueError for another mode, or
-        where the robots do not make whole arenas.
+        Raises ConfigError if robots or targets do not fit, ValueError for an unknown mode or if
+        the robots do not fill whole arenas.
         """
         config = config or ArenaConfig()
         num_envs = config.num_robots if num_envs is None else num_envs
         if num_envs < 1 or num_envs % config.num_robots:
             raise ValueError(
-                f"num_envs {num_envs} makes no whole arenas of {config.num_robots} robots"
+                f"num_envs {num_envs} does not fill arenas of {config.num_robots} robots"
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode {render_mode!r}: there is rgb_array")
+            raise ValueError(f"render_mode {render_mode!r} is not rgb_array")
         self.num_envs = num_envs
         self.render_mode = render_mode
         shape = (config.stack, config.view_px, config.view_px)
@@ -77,7 +78,7 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[UInt8Array, dict[str, Any]]:
-        """Begins an episode in every arena. seed: of these and all that follow."""
+        """Begins an episode in every arena. seed: for these episodes and all that follow."""
         super().reset(seed=seed)
         if seed is not None:
             self._seed(seed)
@@ -88,7 +89,7 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
     def step(
         self, actions: ArrayLike
     ) -> tuple[UInt8Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Plays one frame everywhere, but where an episode ended before, begins the next.
+        """Plays one frame in every arena; where an episode has ended, begins the next instead.
 
         Raises ValueError for actions other than [N] of 0, 1, 2.
         """
@@ -113,14 +114,14 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         )
 
     def render(self) -> tuple[UInt8Array, ...] | None:
-        """Each robot's arena as RGB [600, 600, 3]; None without a mode."""
+        """Renders each robot's arena as RGB [600, 600, 3]; None without a mode."""
         if self.render_mode is None:
             return None
         images = [self._arenas.image(arena) for arena in range(self._num_arenas)]
         return tuple(image for image in images for _ in range(self._config.num_robots))
 
     def _seed(self, seed: int | None) -> None:
-        """New arenas, each with a generator of its own."""
+        """Makes new arenas, each with its own generator."""
         seeds = np.random.SeedSequence(seed).spawn(self._num_arenas)
         self._arenas = StackedArenas(self._config, [np.random.default_rng(s) for s in seeds])
         self._ended = np.ones(self._num_arenas, np.bool_)
@@ -142,11 +143,11 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
         }
 
     def _each(self, arenas: BoolArray) -> BoolArray:
-        """What is true of the arenas, of each of their robots [N]."""
+        """Repeats a value per arena for each of its robots [N]."""
         return np.repeat(arenas, self._config.num_robots)
 
 
 def register() -> None:
-    """Makes gymnasium.make_vec("mrcdrl/Arena-v0", num_envs=…, config=…) known."""
+    """Registers "mrcdrl/Arena-v0" for gymnasium.make_vec(…, num_envs=…, config=…)."""
     if ENV_ID not in gymnasium.registry:
         gymnasium.register(ENV_ID, vector_entry_point=f"{__name__}:ArenaVectorEnv")

@@ -1,1 +1,1 @@
-"""What robots see: renderers, observation records, camera noise."""
+"""The robots' images: renderers, observation records, camera noise."""

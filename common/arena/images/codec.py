@@ -1,7 +1,7 @@
-"""What an observation record holds, and how its image is got back.
+"""Observation records, and the images decoded from them.
 
-Invariants: both codecs give the same pixels for the same scene, because both draw from the scene
-rounded to float32; a record is a fixed number of bytes.
+Invariants: both codecs give the same pixels for the same scene, because both render the scene
+rounded to float32. A record has a fixed number of bytes.
 """
 
 from itertools import accumulate
@@ -21,35 +21,35 @@ _SEED = np.dtype("<u4")
 
 
 class ObservationCodec(Protocol):
-    """Lockstep a scene into one record a robot, and records into images."""
+    """Encodes a scene as one record per robot, and decodes records to images."""
 
     record_bytes: int
 
     def encode(self, scene: Scene, noise_seeds: NoiseSeeds | None = None) -> UInt8Array:
-        """Records [..., K, R] of the robots' views, of one scene or a stack of them.
+        """Encodes the robots' views as records [..., K, R]; takes one scene or a stack of them.
 
-        noise_seeds: [..., K], where the images are noisy; 0 if None.
+        noise_seeds: [..., K], used if the images are noisy; 0 if None.
         """
         ...
 
     def decode(self, records: UInt8Array, out: UInt8Array | None = None) -> UInt8Array:
-        """Images [..., V, V] of records [..., R], in out (C-contiguous) if given."""
+        """Decodes records [..., R] to images [..., V, V], in out (C-contiguous) if given."""
         ...
 
 
 class SceneCodec:
-    """A record is the scene as its robot lists it; the image is drawn when it is needed.
+    """Stores the scene, its own robot first; the image is rendered when it is decoded.
 
-    float32, little-endian: own x, y, heading; x, y, heading of the other robots in their order;
-    x, y of the targets; x, y, radius of the obstacles. Then, with pixel_noise, the seed of the
-    noise as uint32.
+    A record holds little-endian float32: own x, y, heading; x, y, heading of the other robots in
+    order; x, y of the targets; x, y, radius of the obstacles. With pixel_noise, the seed of the
+    noise follows as uint32.
     """
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
         num = config.num_robots
         counts = (3 * num, 2 * config.target_count, 3 * config.obstacle_count)
-        self._ends = tuple(accumulate(counts))  # of robots, targets, obstacles
+        self._ends = tuple(accumulate(counts))  # robots, targets, obstacles
         self.record_bytes = _NUMBER.itemsize * (self._ends[-1] + bool(config.pixel_noise))
         self._order = np.array([[i, *(j for j in range(num) if j != i)] for i in range(num)])
         self._views = AnalyticViews(config) if config.renders_analytically else None
@@ -77,7 +77,7 @@ class SceneCodec:
         scenes = flat.view(_NUMBER)
         views = images.reshape(-1, *images.shape[-2:])
         if self._views is not None:
-            self._views.draw(scenes, views)
+            self._views.render(scenes, views)
         else:
             for view, scene in zip(views, scenes, strict=True):
                 view[:] = literal_views(self._scene_of(scene), self._config)[0]
@@ -91,7 +91,7 @@ class SceneCodec:
 
 
 class FrameCodec:
-    """A record is the image's pixels, row by row."""
+    """Stores the image's pixels, row by row."""
 
     def __init__(self, config: ArenaConfig) -> None:
         self._config = config
@@ -119,7 +119,7 @@ def make_codec(config: ArenaConfig) -> ObservationCodec:
 def _images(
     records: UInt8Array, record_bytes: int, view_px: int, out: UInt8Array | None
 ) -> UInt8Array:
-    """out, or new images, for records; raises ValueError when either does not fit."""
+    """Returns out, or new images if None; raises ValueError if records or out do not fit."""
     if records.dtype != np.uint8 or records.shape[-1:] != (record_bytes,):
         raise ValueError(
             f"records are {records.dtype} {records.shape}, not uint8 [..., {record_bytes}]"

@@ -1,6 +1,6 @@
-"""Grey noise of images as a function of a seed that a record carries.
+"""Pixel noise of images, a function of the seed that a record carries.
 
-Invariants: the same seed gives the same noise on every machine; one draw a pixel.
+Invariants: the same seed gives the same noise on every machine; each pixel takes one draw.
 """
 
 import math
@@ -18,13 +18,13 @@ _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 _LANE, _LANE_MASK = np.uint64(16), np.uint64(0xFFFF)
-# The sum of four uniform 16-bit numbers: all but Gaussian, and at most 3.46 of its deviations.
+# The sum of four uniform 16-bit numbers is nearly Gaussian, within 3.46 standard deviations.
 _MEAN = 2 * 65535.0
 _DEVIATION = math.sqrt(4 * (65536.0**2 - 1) / 12)
 
 
 def add_noise(views: UInt8Array, seeds: NoiseSeeds, deviation: float) -> None:
-    """Adds noise to images [N, V, V] in place; seeds: [N]. Greys beyond 0 ... 255 are cut off."""
+    """Adds noise to images [N, V, V] in place, clipped to 0 ... 255; seeds: [N]."""
     _add_noise(views, np.ascontiguousarray(seeds), deviation / _DEVIATION)
 
 
@@ -40,8 +40,8 @@ def _add_noise(views, seeds, scale):  # type: ignore[no-untyped-def]
                 for _ in range(4):
                     total += np.float64(bits & _LANE_MASK)
                     bits >>= _LANE
-                grey = np.float64(views[n, i, j]) + (total - _MEAN) * scale
-                views[n, i, j] = np.uint8(min(max(grey + 0.5, 0.0), 255.0))
+                intensity = np.float64(views[n, i, j]) + (total - _MEAN) * scale
+                views[n, i, j] = np.uint8(min(max(intensity + 0.5, 0.0), 255.0))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

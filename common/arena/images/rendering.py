@@ -1,8 +1,8 @@
-"""Draws the arena with OpenCV, and cuts the robots' images out of it as the paper does.
+"""Renders the arena with OpenCV, and crops the robots' images from it as the paper does.
 
-Invariants: a place x of the arena is drawn at OpenCV's coordinate x - 1/2, because OpenCV counts
-pixel centres and the arena counts from pixel edges; filled shapes cover the area they have in the
-world (OpenCV paints a disc's rim too, so discs are drawn half a pixel smaller).
+Invariants: position x of the arena is rendered at OpenCV's coordinate x - 1/2, because OpenCV
+counts from pixel centres and the arena from pixel edges. Filled shapes cover the area they have in
+the world (OpenCV fills a disc's rim too, so discs are rendered half a pixel smaller).
 """
 
 import math
@@ -28,7 +28,7 @@ _SHIFT = 8  # fractional bits of OpenCV's coordinates
 def render_arena(
     scene: Scene, config: ArenaConfig, size: int = 600, *, smooth: bool = False
 ) -> UInt8Array:
-    """The arena as BGR [size, size, 3]; smooth: anti-aliased, for people to look at."""
+    """Renders the arena as BGR [size, size, 3]; smooth: anti-aliased, for people to look at."""
     scale = size / config.size_px
     image = np.zeros((size, size, 3), np.uint8)
     line_type = cv2.LINE_AA if smooth else cv2.LINE_8
@@ -37,9 +37,9 @@ def render_arena(
     _fill(image, outer * scale, size - outer * scale, RED)
     _fill(image, inner * scale, size - inner * scale, BLACK)
     for wall in inner_walls(config):
-        _draw_wall(image, wall * scale, line_type)
+        _render_wall(image, wall * scale, line_type)
     for x, y, radius in (scene.obstacles * scale).tolist():
-        _draw_disc(image, x, y, radius, GREEN, line_type)
+        _render_disc(image, x, y, radius, GREEN, line_type)
     half = config.target_size_px / 2
     for x, y in scene.targets.tolist():
         corners = np.array([[x - half, y - half], [x + half, y + half]]) * scale
@@ -47,7 +47,7 @@ def render_arena(
         image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = BLUE
     radius = config.robot_radius_px * scale
     for x, y, _ in scene.robots.tolist():
-        _draw_disc(image, x * scale, y * scale, radius, WHITE, line_type)
+        _render_disc(image, x * scale, y * scale, radius, WHITE, line_type)
     width = max(1, round(HEADING_WIDTH_PX * scale))
     for x, y, heading in scene.robots.tolist():
         rim = (x * scale + radius * math.cos(heading), y * scale + radius * math.sin(heading))
@@ -57,47 +57,47 @@ def render_arena(
 
 
 def literal_views(scene: Scene, config: ArenaConfig) -> UInt8Array:
-    """Images [K, V, V] by the paper's steps (section 4, Fig. 3).
+    """Renders images [K, V, V] by the paper's steps (section 4, Fig. 3).
 
-    The arena is drawn one pixel a px, greyed, the rectangle centred on the robot (rounded to
-    whole pixels) cut out with zeros beyond the border, and resized by area.
+    The arena is rendered at one pixel per px and converted to grayscale. The square centred on the
+    robot (rounded to whole pixels) is cropped, zeros beyond the border, and resized by area.
     """
     image = render_arena(scene, config, config.size_px)
-    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    grayscale = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
     views = np.empty((len(scene.robots), config.view_px, config.view_px), np.uint8)
     for i, (x, y, heading) in enumerate(scene.robots.tolist()):
         window = (
-            _turned_window(grey, x, y, heading, config)
+            _turned_window(grayscale, x, y, heading, config)
             if config.orientation == "heading_up"
-            else _window(grey, x, y, config)
+            else _window(grayscale, x, y, config)
         )
         size = (config.view_px, config.view_px)
         views[i] = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
     return views
 
 
-def _window(grey: UInt8Array, x: float, y: float, config: ArenaConfig) -> UInt8Array:
-    """The square of crop_px around (x, y), zeros beyond the border."""
+def _window(grayscale: UInt8Array, x: float, y: float, config: ArenaConfig) -> UInt8Array:
+    """Crops the square of crop_px around (x, y), zeros beyond the border."""
     width = round(config.crop_px)
     left, top = round(x - config.crop_px / 2), round(y - config.crop_px / 2)
     window = np.zeros((width, width), np.uint8)
-    height, length = grey.shape
+    height, length = grayscale.shape
     x0, x1 = max(left, 0), min(left + width, length)
     y0, y1 = max(top, 0), min(top + width, height)
-    window[y0 - top : y1 - top, x0 - left : x1 - left] = grey[y0:y1, x0:x1]
+    window[y0 - top : y1 - top, x0 - left : x1 - left] = grayscale[y0:y1, x0:x1]
     return window
 
 
 def _turned_window(
-    grey: UInt8Array, x: float, y: float, heading: float, config: ArenaConfig
+    grayscale: UInt8Array, x: float, y: float, heading: float, config: ArenaConfig
 ) -> UInt8Array:
-    """The square of crop_px around (x, y), turned so that the heading points up."""
+    """Crops the square of crop_px around (x, y), rotated so that the heading points up."""
     width = round(config.crop_px)
     c, s = -math.sin(heading), -math.cos(heading)
     x, y = x - 0.5, y - 0.5  # in OpenCV's coordinates
     centre = config.crop_px / 2 - 0.5
     turn = np.array([[c, -s, centre - c * x + s * y], [s, c, centre - s * x - c * y]])
-    return np.asarray(cv2.warpAffine(grey, turn, (width, width)), np.uint8)
+    return np.asarray(cv2.warpAffine(grayscale, turn, (width, width)), np.uint8)
 
 
 def _fill(image: UInt8Array, low: float, high: float, colour: Colour) -> None:
@@ -105,15 +105,15 @@ def _fill(image: UInt8Array, low: float, high: float, colour: Colour) -> None:
     cv2.rectangle(image, (first, first), (last, last), colour, -1)  # ten times faster than numpy
 
 
-def _draw_disc(
+def _render_disc(
     image: UInt8Array, x: float, y: float, radius: float, colour: Colour, line_type: int
 ) -> None:
     rim = round(max(radius - 0.5, 0) * 2**_SHIFT)
     cv2.circle(image, _fixed(x, y), rim, colour, -1, line_type, _SHIFT)
 
 
-def _draw_wall(image: UInt8Array, wall: Float64Array, line_type: int) -> None:
-    """The rectangle of a line with a width [5], half a pixel smaller on all sides."""
+def _render_wall(image: UInt8Array, wall: Float64Array, line_type: int) -> None:
+    """Fills the rectangle of a wall [5], half a pixel smaller on all sides."""
     ends, half = wall[:4].reshape(2, 2), max(wall[4] - 0.5, 0)
     along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     across = half * np.array([-along[1], along[0]])
@@ -124,5 +124,5 @@ def _draw_wall(image: UInt8Array, wall: Float64Array, line_type: int) -> None:
 
 
 def _fixed(x: float, y: float) -> tuple[int, int]:
-    """A place in OpenCV's fixed-point coordinates."""
+    """Converts a position to OpenCV's fixed-point coordinates."""
     return round((x - 0.5) * 2**_SHIFT), round((y - 0.5) * 2**_SHIFT)

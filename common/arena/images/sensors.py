@@ -1,8 +1,8 @@
-"""What the robots' cameras deliver of scenes: noise, and frames that never come.
+"""The robots' cameras: they turn scenes into records, with noise and dropped frames.
 
-Invariants: a record says all that its image shows, the noise by a seed, and a dropped frame by
-being the record before once more; so whoever decodes a record sees the same pixels. Random numbers
-are drawn from an arena's own generator, and only where the configuration asks for them.
+Invariants: a record determines its image. It carries the seed of its noise, and a dropped frame
+repeats the previous record, so everyone who decodes a record sees the same pixels. Random numbers
+come from an arena's own generator, and only if the configuration asks for them.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ class Sensors:
     """The cameras of the robots of A arenas."""
 
     def __init__(self, config: ArenaConfig, rngs: Sequence[np.random.Generator]) -> None:
-        """rngs: one an arena."""
+        """rngs: one per arena."""
         self._config = config
         self._rngs = rngs
         self._codec = make_codec(config)
@@ -28,13 +28,13 @@ class Sensors:
         self._last: UInt8Array = np.zeros(shape, np.uint8)
 
     def first(self, arena: int, scene: Scene) -> UInt8Array:
-        """Records [K, R] of an episode's first scene, which are never dropped."""
+        """Records an episode's first scene [K, R]; this frame is never dropped."""
         records = self._codec.encode(scene, self._noise_seeds(arena))
         self._last[arena] = records
         return records
 
     def read(self, arenas: Int64Array, scenes: Scene) -> UInt8Array:
-        """Records [N, K, R] of the arenas' scenes [N, ...]."""
+        """Records the arenas' scenes [N, ...] as [N, K, R]."""
         config = self._config
         seeds = None
         if config.pixel_noise:

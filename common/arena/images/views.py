@@ -1,11 +1,11 @@
-"""Draws every robot's image straight from poses: the area each shape covers of each pixel.
+"""Renders every robot's image straight from poses, by the area of each pixel a shape covers.
 
-Invariants: an image pixel is the mean over its square of crop_px / view_px arena pixels; the
-window is centred exactly on the robot where it turns with it, and else cuts out whole pixels of the
-arena, as the literal pipeline does; targets fill whole pixels in both. Shapes are painted over one
-another in the order walls, obstacles, targets, robots, headings on a black floor, and black lies
-outside the arena. Coordinates are continuous (pixel i covers [i, i + 1)), so a mapped scene gives
-the mapped image. Records of any bytes give some image: what is not finite is not drawn.
+Invariants: an image pixel is the mean over its square of crop_px / view_px arena pixels. A window
+that rotates with its robot is centred exactly on it; an unrotated one crops whole pixels of the
+arena, as the literal pipeline does. Targets fill whole pixels in both. Shapes cover one another in
+the order walls, obstacles, targets, robots, headings; the floor and everything outside the arena
+are black. Coordinates are continuous (pixel i covers [i, i + 1)), so a mapped scene gives the
+mapped image. Records of any bytes give some image: shapes that are not finite are not rendered.
 """
 
 import math
@@ -17,20 +17,20 @@ from mrcdrl.common.arena.world.obstacles import inner_walls
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array
 
-WALL_INTENSITY = 76  # red, green, blue and white by OpenCV's weights
+WALL_INTENSITY = 76  # OpenCV's grayscale weights, applied to red, green, blue and white
 OBSTACLE_INTENSITY = 150
 TARGET_INTENSITY = 29
 ROBOT_INTENSITY = 255
 HEADING_INTENSITY = 0
 HEADING_WIDTH_PX = 2.0
-# What OpenCV paints of whole pixels, in the mean over places and directions:
+# Measured on the whole pixels that OpenCV fills, in the mean over positions and directions:
 HEADING_HALF_PX = 1.475  # half the width of the line of HEADING_WIDTH_PX
 HEADING_CAP_PX = 1.0  # of the line, beyond the robot's centre and rim
 DISC_LOSS_PX = 0.04  # of a radius of 15 to 40 px
-_NUM_LINES = 4  # scan lines a row of pixels, at Gauss-Legendre nodes: 5 grey levels off at most
+_NUM_LINES = 4  # scan lines per row of pixels, at Gauss-Legendre nodes: an error of at most 5
 _LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(_NUM_LINES)
 NODES, WEIGHTS = (_LEGENDRE_NODES + 1) / 2, _LEGENDRE_WEIGHTS / 2  # on [0, 1]
-_BLOCK = 8  # pixels of a row that a disc paints at once, of the 31 and more there are
+_BLOCK = 8  # pixels of a row that a disc fills at once; a row has 31 or more
 
 
 class AnalyticViews:
@@ -47,9 +47,9 @@ class AnalyticViews:
         self._halves_px = (config.crop_px / 2, config.target_size_px / 2)
         self._radius = max(config.robot_radius_px - DISC_LOSS_PX, 0.0) * scale
 
-    def draw(self, scenes: Float32Array, out: UInt8Array) -> None:
-        """Fills out [N, V, V] from scenes [N, 3 K + 2 M + 3 O] of SceneCodec."""
-        _draw_views(
+    def render(self, scenes: Float32Array, out: UInt8Array) -> None:
+        """Renders scenes [N, 3 K + 2 M + 3 O] of SceneCodec into out [N, V, V]."""
+        _render_views(
             scenes,
             out,
             self._counts,
@@ -63,7 +63,7 @@ class AnalyticViews:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _draw_views(  # type: ignore[no-untyped-def]
+def _render_views(  # type: ignore[no-untyped-def]
     scenes, out, counts, heading_up, scale, wall, inner_walls, halves_px, radius
 ):
     num_robots, num_targets, num_obstacles = counts
@@ -72,7 +72,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
     lines = np.empty((2, _NUM_LINES * size))
     crop_half_px, target_half_px = halves_px
     target_half = target_half_px * scale
-    hand_half, cap = HEADING_HALF_PX * scale, HEADING_CAP_PX * scale
+    line_half, cap = HEADING_HALF_PX * scale, HEADING_CAP_PX * scale
     reach = radius + cap
     for n in range(len(scenes)):
         scene = scenes[n]
@@ -85,7 +85,7 @@ def _draw_views(  # type: ignore[no-untyped-def]
             c, s = -math.sin(scene[2]), -math.cos(scene[2])
         else:
             own_x, own_y = _on_grid(own_x, crop_half_px), _on_grid(own_y, crop_half_px)
-        # places map to (c x - s y, s x + c y) about the robot
+        # positions map to (c x - s y, s x + c y) about the robot
         if heading_up:
             _walls_slanted(view, lines, own_x, own_y, c, s, scale, wall)
         else:
@@ -127,18 +127,18 @@ def _draw_views(  # type: ignore[no-untyped-def]
             if -reach < x < size + reach and -reach < y < size + reach:
                 cos, sin = math.cos(scene[j + 2]), math.sin(scene[j + 2])
                 across, along = c * cos - s * sin, s * cos + c * sin
-                _bar(view, lines, x, y, across, along, -cap, reach, hand_half, HEADING_INTENSITY)
+                _bar(view, lines, x, y, across, along, -cap, reach, line_half, HEADING_INTENSITY)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _on_grid(middle, half):  # type: ignore[no-untyped-def]
-    """The middle of the square, half to either side, once its edges lie between pixels."""
+    """Moves the middle of a square of half-width half so that its edges lie between pixels."""
     return np.rint(np.float64(middle) - half) + half
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _map(x, y, c, s, scale, size):  # type: ignore[no-untyped-def]
-    """Image coordinates of a place relative to the robot."""
+    """Image coordinates of a position relative to the robot."""
     return (c * x - s * y) * scale + 0.5 * size, (s * x + c * y) * scale + 0.5 * size
 
 
@@ -185,14 +185,14 @@ def _inner_walls(view, lines, own_x, own_y, c, s, scale, walls):  # type: ignore
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _blend(value, grey, share):  # type: ignore[no-untyped-def]
-    """A pixel after a shape covered a share of it."""
-    return np.uint8(value + (grey - np.float64(value)) * share + 0.5)
+def _blend(value, intensity, coverage):  # type: ignore[no-untyped-def]
+    """A pixel's value once a shape covers this fraction of it."""
+    return np.uint8(value + (intensity - np.float64(value)) * coverage + 0.5)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _box(view, x0, x1, y0, y1, grey):  # type: ignore[no-untyped-def]
-    """Paints the upright rectangle [x0, x1] x [y0, y1]."""
+def _box(view, x0, x1, y0, y1, intensity):  # type: ignore[no-untyped-def]
+    """Renders the upright rectangle [x0, x1] x [y0, y1]."""
     size = view.shape[0]
     if not (x1 > 0 and x0 < size and y1 > 0 and y0 < size):
         return
@@ -200,39 +200,39 @@ def _box(view, x0, x1, y0, y1, grey):  # type: ignore[no-untyped-def]
     top, bottom = _pixels(y0, y1, size)
     x0, x1 = max(x0, 0.0), min(x1, np.float64(size))
     y0, y1 = max(y0, 0.0), min(y1, np.float64(size))
-    if right - left < bottom - top:  # a wall: few long loops are faster than many short ones
+    if right - left < bottom - top:  # a wall: a few long loops are faster than many short ones
         for j in range(left, right):
             wide = min(j + 1.0, x1) - max(np.float64(j), x0)
             for i in range(top, bottom):
                 tall = min(i + 1.0, y1) - max(np.float64(i), y0)
-                view[i, j] = _blend(view[i, j], grey, tall * wide)
+                view[i, j] = _blend(view[i, j], intensity, tall * wide)
     else:
         for i in range(top, bottom):
             tall = min(i + 1.0, y1) - max(np.float64(i), y0)
             for j in range(left, right):
                 wide = min(j + 1.0, x1) - max(np.float64(j), x0)
-                view[i, j] = _blend(view[i, j], grey, tall * wide)
+                view[i, j] = _blend(view[i, j], intensity, tall * wide)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _pixels(low, high, size):  # type: ignore[no-untyped-def]
-    """First and last + 1 of the rows, or columns, of which [low, high] covers some.
+    """First and last + 1 of the rows, or columns, that [low, high] covers at least in part.
 
-    Unsigned: an index that might count from the end keeps LLVM from making vectors of a loop.
+    Unsigned, because an index that might count from the end keeps LLVM from vectorizing a loop.
     """
     return np.uintp(max(low, 0.0)), np.uintp(math.ceil(min(high, np.float64(size))))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _slice(i, low, high, y):  # type: ignore[no-untyped-def]
-    """What row i holds of [low, high]: its top relative to y, and its height."""
+    """The part of [low, high] in row i: its top relative to y, and its height."""
     top = max(np.float64(i), low) - y
     return top, min(i + 1.0, high) - y - top
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _place_lines(lines, first, last, low, high, y):  # type: ignore[no-untyped-def]
-    """Writes where the rows' scan lines lie relative to y to lines[0]; returns their number."""
+    """Writes the rows' scan lines, relative to y, to lines[0]; returns their number."""
     num = np.uintp(0)
     for i in range(first, last):
         top, tall = _slice(i, low, high, y)
@@ -244,36 +244,36 @@ def _place_lines(lines, first, last, low, high, y):  # type: ignore[no-untyped-d
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _of_row(numbers, row):  # type: ignore[no-untyped-def]
-    """Those of a row's scan lines; row counts from the first that has any."""
+    """The numbers of a row's scan lines; row 0 is the first that has any."""
     at = np.uintp(_NUM_LINES) * row
     one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
     return numbers[at], numbers[at + one], numbers[at + two], numbers[at + three]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _share(left, tall, lows, highs):  # type: ignore[no-untyped-def]
-    """Of the pixel [left, left + 1], covered by its scan lines from low to high.
+def _coverage(left, tall, lows, highs):  # type: ignore[no-untyped-def]
+    """Fraction of the pixel [left, left + 1] that its scan lines cover from low to high.
 
-    Inlined by numba: LLVM would first unroll the loops around a mere call, and so make no vectors.
+    Inlined by numba: around a mere call LLVM would unroll the loops first and not vectorize them.
     """
-    share = WEIGHTS[0] * tall * _part(left, lows[0], highs[0])
-    share += WEIGHTS[1] * tall * _part(left, lows[1], highs[1])
-    share += WEIGHTS[2] * tall * _part(left, lows[2], highs[2])
-    share += WEIGHTS[3] * tall * _part(left, lows[3], highs[3])
-    return min(share, 1.0)
+    coverage = WEIGHTS[0] * tall * _part(left, lows[0], highs[0])
+    coverage += WEIGHTS[1] * tall * _part(left, lows[1], highs[1])
+    coverage += WEIGHTS[2] * tall * _part(left, lows[2], highs[2])
+    coverage += WEIGHTS[3] * tall * _part(left, lows[3], highs[3])
+    return min(coverage, 1.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _part(left, low, high):  # type: ignore[no-untyped-def]
-    """How much of [left, left + 1] lies in [low, high]."""
+    """Length of [left, left + 1] that lies in [low, high]."""
     return max(0.0, min(left + 1.0, high) - max(left, low))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _disc(view, lines, x, y, radius, grey):  # type: ignore[no-untyped-def]
-    """Paints a disc: exact along x, sampled by scan lines along y.
+def _disc(view, lines, x, y, radius, intensity):  # type: ignore[no-untyped-def]
+    """Renders a disc: exact along x, sampled by scan lines along y.
 
-    It paints whole blocks of a row's pixels, covered or not: a block is a vector or two.
+    It fills whole blocks of a row's pixels, covered or not: a block is a vector or two.
     """
     size = view.shape[0]
     if not (x + radius > 0 and x - radius < size and y + radius > 0 and y - radius < size):
@@ -285,7 +285,7 @@ def _disc(view, lines, x, y, radius, grey):  # type: ignore[no-untyped-def]
     for n in range(_place_lines(lines, first, last, low, high, y)):
         chords[n] = math.sqrt(max(radius * radius - chords[n] * chords[n], 0.0))
     for start in range(int(left), int(right), _BLOCK):
-        edge = np.float64(start)  # what lies left of it, the block before has painted
+        edge = np.float64(start)  # the block before has filled what lies left of it
         column = np.uintp(min(start, size - _BLOCK))
         for i in range(first, last):
             tall = _slice(i, low, high, y)[1]
@@ -294,25 +294,25 @@ def _disc(view, lines, x, y, radius, grey):  # type: ignore[no-untyped-def]
             highs = x + c0, x + c1, x + c2, x + c3
             for k in range(_BLOCK):
                 j = column + np.uintp(k)
-                share = _share(np.float64(column) + k, tall, lows, highs)
-                view[i, j] = _blend(view[i, j], grey, share)
+                coverage = _coverage(np.float64(column) + k, tall, lows, highs)
+                view[i, j] = _blend(view[i, j], intensity, coverage)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _bar(view, lines, x, y, dx, dy, start, end, half, grey):  # type: ignore[no-untyped-def]
-    """Paints the rectangle from start to end along (dx, dy) from (x, y), half to either side.
+def _bar(view, lines, x, y, dx, dy, start, end, half, intensity):  # type: ignore[no-untyped-def]
+    """Renders the rectangle from start to end along (dx, dy) from (x, y), half to either side.
 
     Scan lines cross it the short way, where its extent is exact.
     """
     if abs(dx) >= abs(dy):
-        _bar_across(view.T, lines, y, x, dy, dx, start, end, half, grey)
+        _bar_across(view.T, lines, y, x, dy, dx, start, end, half, intensity)
     else:
-        _bar_across(view, lines, x, y, dx, dy, start, end, half, grey)
+        _bar_across(view, lines, x, y, dx, dy, start, end, half, intensity)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _bar_across(view, lines, x, y, dx, dy, start, end, half, grey):  # type: ignore[no-untyped-def]
-    """_bar with scan lines along the view's rows, for |dy| >= |dx|."""
+def _bar_across(view, lines, x, y, dx, dy, start, end, half, intensity):  # type: ignore[no-untyped-def]
+    """Renders a _bar with scan lines along the view's rows, for |dy| >= |dx|."""
     size = view.shape[0]
     low_y = y + min(start * dy, end * dy) - half * abs(dx)
     high_y = y + max(start * dy, end * dy) + half * abs(dx)
@@ -322,7 +322,7 @@ def _bar_across(view, lines, x, y, dx, dy, start, end, half, grey):  # type: ign
         return
     first, last = _pixels(low_y, high_y, size)
     width, slope = half / abs(dy), dx / dy
-    across = 1.0 / (dx if abs(dx) > 1e-9 else 1e-9)  # to an end, for each px along
+    across = 1.0 / (dx if abs(dx) > 1e-9 else 1e-9)  # to an end, per px along
     lows, highs = lines[0], lines[1]
     for n in range(_place_lines(lines, first, last, low_y, high_y, y)):
         t = lows[n]
@@ -335,5 +335,5 @@ def _bar_across(view, lines, x, y, dx, dy, start, end, half, grey):  # type: ign
         its_lows, its_highs = _of_row(lows, i - first), _of_row(highs, i - first)
         low, high = min(its_lows), max(its_highs)
         for j in range(int(min(low, high)), math.ceil(high)):  # signed: too few for a vector
-            share = _share(np.float64(j), tall, its_lows, its_highs)
-            view[i, j] = _blend(view[i, j], grey, share)
+            coverage = _coverage(np.float64(j), tall, its_lows, its_highs)
+            view[i, j] = _blend(view[i, j], intensity, coverage)

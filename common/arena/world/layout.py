@@ -1,7 +1,7 @@
-"""Where the targets stand, and which symmetries of the square leave the layout as it is.
+"""Layouts of targets and obstacles, and the symmetries that leave a layout unchanged.
 
-Invariants: in every layout that leaves here each target is near enough to a place where a robot
-can be, and no two are so near that two robots cannot stand on them together.
+Invariants: in every layout each target is within reach of a place where a robot can stand, and no
+two targets are too close for two robots to stand on them at the same time.
 """
 
 from functools import cache
@@ -11,12 +11,12 @@ import numpy as np
 
 from mrcdrl.common.arena.world.obstacles import (
     STANDING_PX,
+    clearance_px,
     given_obstacles,
     inner_walls,
     obstacles_for,
     reachable_px,
-    room_px,
-    scattered,
+    scatter,
 )
 from mrcdrl.common.arena.world.scene import Layout
 from mrcdrl.common.arena.world.symmetry import IDENTITY, SYMMETRIES, Symmetry
@@ -25,7 +25,7 @@ from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Float64Array
 
 _LAYOUT_SIZE_PX = 600
-_TRIES = 2000  # of all targets at once
+_TRIES = 2000  # each draws all targets at once
 
 _FIXED: dict[int, tuple[tuple[float, float], ...]] = {
     1: ((300, 300),),
@@ -48,20 +48,20 @@ _FIXED: dict[int, tuple[tuple[float, float], ...]] = {
 def fixed_layout(num_targets: int) -> Float64Array:
     """Target centres [M, 2] px of the built-in layout in an arena of 600 px.
 
-    Raises ConfigError for a number without a layout.
+    Raises ConfigError if there is no layout for this number.
     """
     if num_targets not in _FIXED:
         raise ConfigError(
-            f"no fixed layout for {num_targets} targets; there is one for 1 to 10: give targets_px "
-            'or target_layout = "random"'
+            f"no fixed layout for {num_targets} targets, only for 1 to 10; set targets_px or "
+            'target_layout = "random"'
         )
     return np.array(_FIXED[num_targets], np.float64)
 
 
 def layout_for(config: ArenaConfig, rng: np.random.Generator) -> Layout:
-    """Targets and obstacles of the next episode: the fixed ones, or drawn with rng.
+    """Targets and obstacles of the next episode, fixed or drawn with rng.
 
-    Raises ConfigError when no such layout fits, naming what does not.
+    Raises ConfigError if they do not fit, naming those that do not.
     """
     if config.target_layout == "random":
         obstacles = obstacles_for(config, np.empty((0, 2)), rng)
@@ -81,12 +81,12 @@ def _given_targets(config: ArenaConfig) -> Float64Array:
 
 
 def layout_symmetries(config: ArenaConfig) -> tuple[Symmetry, ...]:
-    """The symmetries of the square under which an agent's experience stays true.
+    """Symmetries of the square under which an agent's experience stays valid.
 
-    Unrotated images: those that map onto itself whatever is not random: targets, obstacles and
-    inner walls; all 8 if nothing is fixed. Heading-up images: a rotation of the arena changes
-    nothing in them, a reflection mirrors them left to right; so the identity, and the mirror if a
-    reflection maps the layout onto itself.
+    Unrotated images: those that map all fixed targets, obstacles and inner walls onto themselves;
+    all 8 if nothing is fixed. Heading-up images do not change when the arena is rotated, and a
+    reflection mirrors them left to right: so the identity, and the mirror if a reflection maps the
+    layout onto itself.
     """
     kept = tuple(symmetry for symmetry in SYMMETRIES if _maps_onto_itself(symmetry, config))
     if config.orientation == "unrotated":
@@ -102,16 +102,16 @@ def _random_targets(
     low, high = low + STANDING_PX, high - STANDING_PX
     apart = 2 * config.robot_radius_px + 2 * config.success_radius_px
     if config.target_count > config.num_robots or len(obstacles) or config.inner_walls_px:
-        targets = scattered(
+        targets = scatter(
             config.target_count,
             (low, high),
             apart,
-            lambda places: room_px(config, places, obstacles) >= STANDING_PX,
+            lambda places: clearance_px(config, places, obstacles) >= STANDING_PX,
             rng,
         )
         if targets is not None:
             return targets
-    else:  # as ever, so that a seed's episodes stay what they were
+    else:  # the original rule, so that a seed still gives the same episodes
         for _ in range(_TRIES if high >= low else 0):
             targets = rng.uniform(low, high, (config.num_robots, 2))
             if _nearest_pair_px(targets) >= apart:
@@ -124,19 +124,19 @@ def _random_targets(
 
 def _check_solvable(config: ArenaConfig, targets: Float64Array) -> None:
     low, high = reachable_px(config)
-    way = np.hypot(*(targets - np.clip(targets, low, high)).T)
-    if (way >= config.success_radius_px).any():
-        x, y = targets[int(way.argmax())]
+    distances = np.hypot(*(targets - np.clip(targets, low, high)).T)
+    if (distances >= config.success_radius_px).any():
+        x, y = targets[int(distances.argmax())]
         raise ConfigError(
             f"target ({x:g}, {y:g}) cannot be reached: robots' centres stay between {low:g} and "
             f"{high:g} px, success needs {config.success_radius_px:g} px"
         )
-    room = room_px(config, targets, given_obstacles(config))
-    if (room < 0).any():
-        x, y = targets[int(room.argmin())]
+    clearances = clearance_px(config, targets, given_obstacles(config))
+    if (clearances < 0).any():
+        x, y = targets[int(clearances.argmin())]
         raise ConfigError(
             f"target ({x:g}, {y:g}) cannot be reached: a robot on it would overlap an obstacle or "
-            "an inner wall; move the one or the other"
+            "an inner wall; move the target or the obstacle"
         )
     nearest = _nearest_pair_px(targets)
     if nearest + 2 * config.success_radius_px <= 2 * config.robot_radius_px:
@@ -154,7 +154,7 @@ def _nearest_pair_px(targets: Float64Array) -> float:
 
 
 def _maps_onto_itself(symmetry: Symmetry, config: ArenaConfig) -> bool:
-    """Whether all that is not random stays where it is."""
+    """Whether the symmetry leaves everything fixed unchanged."""
 
     def mapped(points: Float64Array) -> Float64Array:
         return symmetry.apply_to_points(points, config.size_px)
@@ -168,15 +168,15 @@ def _maps_onto_itself(symmetry: Symmetry, config: ArenaConfig) -> bool:
     if config.target_layout == "fixed":
         targets = _given_targets(config)
         fixed.append((targets, mapped(targets)))
-    return all(_same_rows(rows, images) for rows, images in fixed)
+    return all(_same_rows(rows, mapped_rows) for rows, mapped_rows in fixed)
 
 
 def _both_ways(ends: Float64Array, others: Float64Array) -> Float64Array:
-    """Lines [2 S, 4], each from either end."""
-    there, back = np.concatenate([ends, others], 1), np.concatenate([others, ends], 1)
-    return np.concatenate([there, back])
+    """Lines [2 S, 4], each in both directions."""
+    forwards, backwards = np.concatenate([ends, others], 1), np.concatenate([others, ends], 1)
+    return np.concatenate([forwards, backwards])
 
 
-def _same_rows(rows: Float64Array, images: Float64Array) -> bool:
-    gaps = np.abs(images[:, None] - rows[None]).max(axis=2)
+def _same_rows(rows: Float64Array, others: Float64Array) -> bool:
+    gaps = np.abs(others[:, None] - rows[None]).max(axis=2)
     return bool((gaps.min(axis=1, initial=np.inf) < 1e-6).all())

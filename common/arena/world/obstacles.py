@@ -1,8 +1,8 @@
-"""What stands in the robots' way and stays there: the walls, inner walls, and discs.
+"""Fixed obstacles: outer walls, inner walls and discs.
 
-Invariants: obstacles are discs [O, 3] of x, y, radius; walls are lines with a width [S, 5], x, y of
-both ends and half the width; all px. Between random obstacles, and between them and anything else
-that stays, a robot has room to pass, so that they cut off no part of the arena.
+Invariants: obstacles are discs [O, 3] of x, y, radius; walls are lines with a width [S, 5]: x, y of
+both ends and half the width; all in px. A robot has room to pass between a random obstacle and
+everything else that is fixed, so that random obstacles cut off no part of the arena.
 """
 
 from collections.abc import Callable
@@ -14,22 +14,22 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import BoolArray, Float64Array
 
-_CANDIDATES = 64  # places drawn at once for one thing
-_RESTARTS = 200  # of things drawn one after the other
-_PASSAGE_PX = 10.0  # beside a robot that passes between obstacles
-STANDING_PX = 5.0  # beside a robot that stands on a random target
+_CANDIDATES = 64  # positions drawn at once for one obstacle or target
+_RESTARTS = 200  # after which obstacles or targets that do not fit are given up
+_PASSAGE_PX = 10.0  # margin for a robot that passes between obstacles
+STANDING_PX = 5.0  # margin for a robot on a random target
 
 
 def reachable_px(config: ArenaConfig) -> tuple[float, float]:
-    """Least and greatest coordinate at which a robot's centre can be."""
+    """Least and greatest coordinate that a robot's centre can have."""
     low = config.wall_offset_px + config.wall_thickness_px + config.robot_radius_px
     return low, config.size_px - low
 
 
 def outer_walls(config: ArenaConfig) -> Float64Array:
-    """The four walls around, [4, 5].
+    """The four outer walls [4, 5].
 
-    From the inner face outwards they are two steps wide, so that no step leads over one.
+    They extend two steps outwards from their inner face, so that no step can cross one.
     """
     half = config.step_px
     inner = config.wall_offset_px + config.wall_thickness_px
@@ -41,23 +41,23 @@ def outer_walls(config: ArenaConfig) -> Float64Array:
 
 @cache
 def inner_walls(config: ArenaConfig) -> Float64Array:
-    """The configuration's inner walls, [S, 5]; to be read only."""
+    """The configuration's inner walls [S, 5]; read-only."""
     half = config.wall_thickness_px / 2
     return np.array([(*wall, half) for wall in config.inner_walls_px]).reshape(-1, 5)
 
 
 @cache
 def given_obstacles(config: ArenaConfig) -> Float64Array:
-    """The configuration's obstacles, [G, 3]; to be read only."""
+    """The configuration's obstacles [G, 3]; read-only."""
     return np.array(config.obstacles_px, np.float64).reshape(-1, 3)
 
 
 def obstacles_for(
     config: ArenaConfig, targets: Float64Array, rng: np.random.Generator
 ) -> Float64Array:
-    """Obstacles [O, 3] of the next episode: the given ones, then those drawn with rng.
+    """Obstacles [O, 3] of the next episode: the configured ones, then those drawn with rng.
 
-    targets: [M, 2], on which robots must still be able to stand. Raises ConfigError when the
+    targets: [M, 2], on which robots must still be able to stand. Raises ConfigError if the
     obstacles do not fit.
     """
     given = given_obstacles(config)
@@ -71,10 +71,10 @@ def obstacles_for(
     def clear(places: Float64Array) -> BoolArray:
         from_targets = np.linalg.norm(places[:, None] - targets, axis=2)
         near = from_targets < radius + config.robot_radius_px + STANDING_PX
-        free: BoolArray = (room_px(config, places, given) >= beyond) & ~near.any(axis=1)
+        free: BoolArray = (clearance_px(config, places, given) >= beyond) & ~near.any(axis=1)
         return free
 
-    drawn = scattered(
+    drawn = scatter(
         config.num_obstacles, (low + beyond, high - beyond), 2 * radius + passage, clear, rng
     )
     if drawn is None:
@@ -86,43 +86,45 @@ def obstacles_for(
     return np.concatenate([given, np.insert(drawn, 2, radius, axis=1)])
 
 
-def room_px(config: ArenaConfig, places: Float64Array, obstacles: Float64Array) -> Float64Array:
+def clearance_px(
+    config: ArenaConfig, places: Float64Array, obstacles: Float64Array
+) -> Float64Array:
     """Gap [...] between a robot's rim at places [..., 2] and the nearest obstacle or inner wall.
 
-    Negative where they overlap, infinite where there is none.
+    Negative if they overlap, infinite if there are none.
     """
-    ways, widths = ways_from(config, places, obstacles)
-    gaps = np.linalg.norm(ways, axis=-1) - widths - config.robot_radius_px
+    offsets, widths = offsets_from(config, places, obstacles)
+    gaps = np.linalg.norm(offsets, axis=-1) - widths - config.robot_radius_px
     return np.asarray(gaps.min(axis=-1, initial=np.inf), np.float64)
 
 
-def ways_from(
+def offsets_from(
     config: ArenaConfig, places: Float64Array, obstacles: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Ways [..., O + S, 2] to places [..., 2] from the middle of each obstacle and inner wall.
+    """Offsets [..., O + S, 2] of places [..., 2] from each obstacle's centre and inner wall's axis.
 
-    And by how much each of them is wider than its middle [O + S].
+    Also returns the half-widths [O + S] of the obstacles and walls.
     """
     walls = inner_walls(config)
     starts, lines = walls[:, :2], walls[:, 2:4] - walls[:, :2]
     from_starts = places[..., None, :] - starts
-    shares = (from_starts * lines).sum(axis=-1) / (lines * lines).sum(axis=-1)
-    from_walls = from_starts - np.clip(shares, 0, 1)[..., None] * lines
+    fractions = (from_starts * lines).sum(axis=-1) / (lines * lines).sum(axis=-1)
+    from_walls = from_starts - np.clip(fractions, 0, 1)[..., None] * lines
     from_obstacles = places[..., None, :] - obstacles[:, :2]
-    ways = np.concatenate([from_obstacles, from_walls], axis=-2)
-    return ways, np.concatenate([obstacles[:, 2], walls[:, 4]])
+    offsets = np.concatenate([from_obstacles, from_walls], axis=-2)
+    return offsets, np.concatenate([obstacles[:, 2], walls[:, 4]])
 
 
-def scattered(
+def scatter(
     num: int,
     bounds: tuple[float, float],
     apart: float,
     clear: Callable[[Float64Array], BoolArray],
     rng: np.random.Generator,
 ) -> Float64Array | None:
-    """Clear places [num, 2] drawn one after the other, each `apart` from all before.
+    """Draws clear places [num, 2] one by one, each at least `apart` from all before.
 
-    None where there is no room.
+    Returns None if there is no room.
     """
     low, high = bounds
     for _ in range(_RESTARTS if high >= low else 0):

@@ -1,15 +1,14 @@
 """Moves the robots of many arenas and finds their collisions, compiled.
 
-Each robot turns, then proposes its way of step_px. Two proposals that overlap undo each other, one
-into a wall or an obstacle is undone (the turn stays); a proposal that overlaps a robot so restored
-is undone too, until none does. All whose way was undone have collided. With back_off_frames, a
-robot that collided is driven straight backwards for that many frames, whatever its action; it may
-be blocked again meanwhile, which neither counts as its collision nor prolongs it.
+Each robot turns, then proposes a move of step_px. Two proposals that overlap undo each other; one
+into a wall or an obstacle is undone (the turn stays). A proposal that overlaps a robot restored in
+this way is undone too, until none does. Every robot whose move was undone has collided. With
+back_off_frames, a robot that collided is driven straight backwards for that many frames, whatever
+its action. It may be blocked again meanwhile, which is not counted and does not prolong it.
 
-Invariants: after every move no two robots' centres are nearer than two radii and no robot overlaps
-a wall or an obstacle (touching is allowed); the outcome does not depend on
-the robots' order. Numbers are computed as pymunk does, so that both give the same bits
-(common.arena.pymunk_physics).
+Invariants: after every move no two robots' centres are nearer than two radii, and no robot overlaps
+a wall or an obstacle (touching is allowed). The outcome does not depend on the robots' order.
+Numbers are computed as pymunk does, to the same bits (mrcdrl.common.arena.world.pymunk_physics).
 """
 
 import math
@@ -25,33 +24,33 @@ from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, Int64Arra
 
 
 class Physics(Protocol):
-    """The robots of A arenas, none of which is placed at first."""
+    """The robots of A arenas; each arena must be placed before it moves."""
 
     @property
     def robots(self) -> Float64Array:
-        """Poses [A, K, 3]; to be read only."""
+        """Poses [A, K, 3]; read-only."""
         ...
 
     def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
         """Puts an arena's robots at the poses [K, 3] and forgets their collisions.
 
-        obstacles: discs [O, 3] that stay. Raises ValueError when a robot overlaps anything.
+        obstacles: fixed discs [O, 3]. Raises ValueError if a robot overlaps anything.
         """
         ...
 
     def move(
         self, arenas: Int64Array, actions: UInt8Array, failed: BoolArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Lockstep and moves every robot of the arenas [N] at once; actions: [N, K].
+        """Turns and moves every robot of the arenas [N] at once; actions: [N, K].
 
-        failed: robots [N, K] that stand and are in the others' way. Returns who collided [N, K]
-        and, of those, whose way led into a wall or obstacle [N, K].
+        failed: robots [N, K] that stand still as obstacles to the others. Returns the robots that
+        collided [N, K] and those of them that hit a wall or an obstacle [N, K].
         """
         ...
 
 
 class ArrayPhysics:
-    """The rule as one compiled loop over arrays."""
+    """Physics as one compiled loop over arrays."""
 
     def __init__(self, config: ArenaConfig, num_arenas: int) -> None:
         self._config = config
@@ -95,7 +94,7 @@ class ArrayPhysics:
 
 
 def check_placed(config: ArenaConfig, robots: Float64Array, obstacles: Float64Array) -> None:
-    """Raises ValueError when a robot at the poses [K, 3] overlaps anything."""
+    """Raises ValueError if a robot at the poses [K, 3] overlaps anything."""
     bounds, radius = reachable_px(config), config.robot_radius_px
     i, problem = _first_misplaced(robots, bounds, radius, inner_walls(config), obstacles)
     if problem:
@@ -105,7 +104,7 @@ def check_placed(config: ArenaConfig, robots: Float64Array, obstacles: Float64Ar
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _first_misplaced(robots, bounds, radius, walls, obstacles):  # type: ignore[no-untyped-def]
-    """The first robot that cannot be where it is, and why: 1 bounds, 2 what stays, 3 a robot."""
+    """The first misplaced robot, and why: 1 out of bounds, 2 on something fixed, 3 on a robot."""
     low, high = bounds
     for i in range(len(robots)):
         x, y, heading = robots[i]
@@ -148,9 +147,9 @@ def _move_all(  # type: ignore[no-untyped-def]
             if backs[i] == 0 and actions[n, i] != STRAIGHT:
                 turn = (np.int64(actions[n, i]) - STRAIGHT) * turn_rad
                 poses[i, 2] = _wrapped(poses[i, 2] + turn)
-            way = -step_px if backs[i] > 0 else step_px
-            places[i, 0] = poses[i, 0] + way * math.cos(poses[i, 2])
-            places[i, 1] = poses[i, 1] + way * math.sin(poses[i, 2])
+            distance = -step_px if backs[i] > 0 else step_px
+            places[i, 0] = poses[i, 0] + distance * math.cos(poses[i, 2])
+            places[i, 1] = poses[i, 1] + distance * math.sin(poses[i, 2])
             beyond[i] = _meets_fixed(
                 places[i, 0], places[i, 1], radius, walls, obstacles[arenas[n]]
             )
@@ -169,9 +168,9 @@ def _move_all(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _block(poses, places, radius, beyond, blocked, hits):  # type: ignore[no-untyped-def]
-    """Puts places [K, 2] that cannot be taken back to the poses', and marks them blocked.
+    """Resets places [K, 2] that cannot be taken to the poses, and marks them blocked.
 
-    Robots that are blocked already stand where they are.
+    Robots that are blocked already do not move.
     """
     again = True
     while again:
@@ -197,7 +196,7 @@ def _meets_robot(i, places, radius):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _meets_fixed(x, y, radius, walls, obstacles):  # type: ignore[no-untyped-def]
-    """Whether the disc overlaps an obstacle, or a wall: its nearest point is too near."""
+    """Whether the disc overlaps an obstacle, or a wall by its nearest point."""
     for n in range(len(obstacles)):
         across, along = obstacles[n, 0] - x, obstacles[n, 1] - y
         reach = radius + obstacles[n, 2]
@@ -216,7 +215,7 @@ def _meets_fixed(x, y, radius, walls, obstacles):  # type: ignore[no-untyped-def
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _wrapped(angle):  # type: ignore[no-untyped-def]
-    """math.remainder(angle, math.tau), which numba lacks; both are exact."""
+    """Computes math.remainder(angle, math.tau), which numba lacks; both are exact."""
     rest = np.fmod(angle, math.tau)
     if rest > math.pi:
         return rest - math.tau

@@ -1,6 +1,6 @@
-"""The rule of common.arena.physics by pymunk: the reference for the compiled one.
+"""The collision rule with pymunk, the reference for the compiled physics.
 
-Invariants: those of common.arena.physics.
+Invariants: those of mrcdrl.common.arena.world.physics.
 """
 
 import math
@@ -18,7 +18,7 @@ Pose = tuple[float, float, float]
 
 
 class PymunkPhysics:
-    """A pymunk space an arena."""
+    """Physics with one pymunk space per arena."""
 
     def __init__(self, config: ArenaConfig, num_arenas: int) -> None:
         self._worlds = [World(config) for _ in range(num_arenas)]
@@ -60,11 +60,11 @@ class World:
 
     @property
     def robots(self) -> Float64Array:
-        """Poses [K, 3], a copy."""
+        """A copy of the poses [K, 3]."""
         return np.array(self._poses, np.float64)
 
     def place(self, robots: Float64Array, obstacles: Float64Array) -> None:
-        """As Physics.place, of this arena."""
+        """Places this arena's robots, as Physics.place does."""
         check_placed(self._config, robots, obstacles)
         self._space.remove(*self._obstacles)
         self._obstacles = [pymunk.Circle(self._still, r, (x, y)) for x, y, r in obstacles.tolist()]
@@ -73,7 +73,7 @@ class World:
         self._back_off = [0] * len(self._poses)
 
     def move(self, actions: UInt8Array, failed: BoolArray) -> tuple[BoolArray, BoolArray]:
-        """As Physics.move, of this arena: who collided [K], and whose way led into what stays."""
+        """Moves this arena's robots and returns masks [K], as Physics.move does."""
         waiting = set(np.flatnonzero(~failed).tolist())
         turned, proposals = self._poses.copy(), self._poses.copy()
         for i in waiting:
@@ -110,8 +110,8 @@ class World:
 
     def _advance(self, i: int, pose: Pose) -> Pose:
         x, y, heading = pose
-        way = -self._config.step_px if self._back_off[i] else self._config.step_px
-        return x + way * math.cos(heading), y + way * math.sin(heading), heading
+        distance = -self._config.step_px if self._back_off[i] else self._config.step_px
+        return x + distance * math.cos(heading), y + distance * math.sin(heading), heading
 
     def _meets_fixed(self, i: int) -> bool:
         met = self._space.shape_query(self._shapes[i])

@@ -1,6 +1,6 @@
-"""What a frame is worth to each robot (paper section 3), in many arenas at once.
+"""Rewards of a frame (paper section 3), for many arenas at once.
 
-Invariants: pure functions of the scene after the frame; success is all robots' or none's.
+Invariants: pure functions of the scene after the frame; the robots succeed together or not at all.
 """
 
 import math
@@ -16,15 +16,15 @@ from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, Float64Ar
 def frame_rewards(
     scene: Scene, collided: BoolArray, failed: BoolArray, frames: Int64Array, config: ArenaConfig
 ) -> tuple[Float32Array, BoolArray]:
-    """Rewards [N, K] of a frame of N arenas, and in which of them it is success [N].
+    """Rewards [N, K] of a frame of N arenas, and the mask [N] of those that succeed.
 
-    scene: of all the arenas [N, ...], after the frame's moves. collided, failed: [N, K]. frames: f
-    of the paper [N], 1 after the first move. A robot that collided gets collision_reward, wherever
-    it stands; one that failed is paid like any other, and success does not wait for it.
+    scene: all the arenas [N, ...], after the frame's moves. collided, failed: [N, K]. frames: the
+    paper's f [N], 1 after the first move. A robot that collided gets collision_reward wherever it
+    is; one that failed is rewarded like any other, and success does not wait for it.
     """
     rewards = np.empty(collided.shape, np.float32)
     success = np.empty(len(collided), np.bool_)
-    _judge_all(
+    _reward_all(
         scene.robots,
         scene.targets,
         collided,
@@ -42,19 +42,19 @@ def frame_rewards(
 
 
 def target_distances_px(scene: Scene) -> Float64Array:
-    """chi: distances [K, M] of the robots' centres from the targets'."""
+    """Distances [K, M] from the robots' centres to the targets' (the paper's chi)."""
     gaps = scene.robots[:, None, :2] - scene.targets[None]
     distances: Float64Array = np.sqrt((gaps * gaps).sum(axis=2))
     return distances
 
 
 def on_target_px(config: ArenaConfig) -> float:
-    """sqrt(s_w^2 + s_h^2 + c_r) as printed: nearer than this is "on" a target."""
+    """Distance below which a robot is "on" a target: sqrt(s_w^2 + s_h^2 + c_r), as printed."""
     return math.sqrt(2 * config.target_size_px**2 + config.robot_radius_px)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _judge_all(  # type: ignore[no-untyped-def]
+def _reward_all(  # type: ignore[no-untyped-def]
     robots,
     targets,
     collided,
@@ -64,11 +64,11 @@ def _judge_all(  # type: ignore[no-untyped-def]
     reach,
     proximity,
     f_max,
-    paid,
+    reward_values,
     rewards,
     success,
 ):
-    success_reward, collision_reward, step_reward = paid
+    success_reward, collision_reward, step_reward = reward_values
     num_robots, num_targets = robots.shape[1], targets.shape[1]
     distances = np.empty((num_robots, num_targets), np.float64)
     for n in range(len(robots)):
@@ -77,7 +77,7 @@ def _judge_all(  # type: ignore[no-untyped-def]
                 across = robots[n, i, 0] - targets[n, j, 0]
                 along = robots[n, i, 1] - targets[n, j, 1]
                 distances[i, j] = math.sqrt(across * across + along * along)
-        success[n] = not collided[n].any() and _each_has_its_own(distances, delta, failed[n])
+        success[n] = not collided[n].any() and _all_on_distinct_targets(distances, delta, failed[n])
         frames_left = 1 - min(frames[n], f_max) / f_max
         for i in range(num_robots):
             nearest = distances[i].min()
@@ -92,8 +92,8 @@ def _judge_all(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _each_has_its_own(distances, delta, failed):  # type: ignore[no-untyped-def]
-    """Whether every robot [K] that works has a target [M] nearer than delta for itself."""
+def _all_on_distinct_targets(distances, delta, failed):  # type: ignore[no-untyped-def]
+    """Whether every working robot [K] can be given its own target [M] nearer than delta."""
     num_robots, num_targets = distances.shape
     for robot in range(num_robots):
         if not failed[robot] and distances[robot].min() >= delta:
@@ -102,18 +102,18 @@ def _each_has_its_own(distances, delta, failed):  # type: ignore[no-untyped-def]
     tried = np.empty(num_targets, np.bool_)
     for robot in range(num_robots):
         tried[:] = False
-        if not failed[robot] and not _seat(robot, distances, delta, owners, tried):
+        if not failed[robot] and not _assign(robot, distances, delta, owners, tried):
             return False
     return True
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _seat(robot, distances, delta, owners, tried):  # type: ignore[no-untyped-def]
-    """Gives the robot a target, moving owners on where that helps (an augmenting path)."""
+def _assign(robot, distances, delta, owners, tried):  # type: ignore[no-untyped-def]
+    """Gives the robot a target, reassigning owners if that helps (an augmenting path)."""
     for target in range(len(owners)):
         if distances[robot, target] < delta and not tried[target]:
             tried[target] = True
-            if owners[target] < 0 or _seat(owners[target], distances, delta, owners, tried):
+            if owners[target] < 0 or _assign(owners[target], distances, delta, owners, tried):
                 owners[target] = robot
                 return True
     return False

@@ -1,8 +1,8 @@
-"""What there is to see: the state of the world at one frame, and the words for actions.
+"""The state of the world at one frame, and the actions.
 
-Invariants: coordinates are continuous pixels of the arena, x to the right and y down as in
-images, pixel i covering [i, i + 1); a heading of 0 looks along +x and grows clockwise to the
-viewer, because y points down.
+Invariants: coordinates are continuous pixels of the arena, x to the right and y down as in images;
+pixel i covers [i, i + 1). A heading of 0 points along +x; headings grow clockwise to the viewer,
+because y points down.
 """
 
 from dataclasses import dataclass, field
@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float64Array, UInt8Array
 
 LEFT = 0
-"""Heading decreases by `turn_deg`: anticlockwise to the viewer. Then the robot moves on."""
+"""Turns by `turn_deg`, anticlockwise to the viewer, then moves forward."""
 STRAIGHT = 1
-"""Moves on."""
+"""Keeps its heading and moves forward."""
 RIGHT = 2
-"""Heading increases by `turn_deg`: clockwise to the viewer. Then the robot moves on."""
+"""Turns by `turn_deg`, clockwise to the viewer, then moves forward."""
 
 
 def _none() -> Float64Array:
@@ -26,7 +26,7 @@ def _none() -> Float64Array:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What stays where it is for an episode: M targets and O obstacles."""
+    """The M targets and O obstacles of an episode, which do not move."""
 
     targets: Float64Array  # [M, 2], x px, y px
     obstacles: Float64Array = field(default_factory=_none)  # [O, 3], x px, y px, radius px
@@ -34,7 +34,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Poses of K robots, places of M targets, and O obstacles."""
+    """Poses of K robots, positions of M targets, and O obstacles."""
 
     robots: Float64Array  # [K, 3], x px, y px, heading rad
     targets: Float64Array  # [M, 2], x px, y px
@@ -43,7 +43,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where an episode begins: the same arrays as a scene's."""
+    """The state in which an episode begins; the same arrays as a scene's."""
 
     robots: Float64Array  # [K, 3], x px, y px, heading rad
     targets: Float64Array  # [M, 2], x px, y px
@@ -51,7 +51,7 @@ class Start:
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...]) -> UInt8Array:
-    """actions as uint8 of this shape; raises ValueError for another shape, kind or value."""
+    """Converts actions to uint8; raises ValueError if shape, dtype or values are wrong."""
     array = np.asarray(actions)
     if array.shape != shape or array.dtype.kind not in "iu":
         raise ValueError(f"actions are {array.dtype} {array.shape}, not integers {shape}")

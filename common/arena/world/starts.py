@@ -1,7 +1,7 @@
-"""Where robots begin: at random in training, and by the paper's rule in the test (section 5.3).
+"""Robots' starting poses: random in training, by the paper's rule in the test (section 5.3).
 
-Invariants: starts never overlap nor touch a wall from beyond; the same configuration and seed
-give the same starts in every process.
+Invariants: in a start no robot overlaps another or a wall; the same configuration and seed give
+the same starts in every process.
 """
 
 import math
@@ -9,30 +9,30 @@ import math
 import numpy as np
 
 from mrcdrl.common.arena.world.layout import layout_for
-from mrcdrl.common.arena.world.obstacles import reachable_px, room_px
+from mrcdrl.common.arena.world.obstacles import clearance_px, reachable_px
 from mrcdrl.common.arena.world.scene import Layout, Start
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import BoolArray, Float64Array
 
-_CANDIDATES = 32  # poses drawn at once for one robot
-_RESTARTS = 200  # of a placement that got stuck
+_CANDIDATES = 32  # poses drawn at once per robot
+_RESTARTS = 200  # after which a placement that got stuck is given up
 
 
 def training_start(config: ArenaConfig, layout: Layout, rng: np.random.Generator) -> Start:
-    """A start with random poses in the layout.
+    """Draws a start with random poses in the layout.
 
-    Raises ConfigError when the robots do not fit.
+    Raises ConfigError if the robots do not fit.
     """
     poses = _place(config, layout.obstacles, rng, num_turns=0)
     return Start(poses, layout.targets, layout.obstacles)
 
 
 def test_starts(config: ArenaConfig, num: int, seed: int) -> tuple[Start, ...]:
-    """Starts of the paper's test: no collision at the start nor within one rotation.
+    """Draws starts of the paper's test: no collision at the start or within one rotation.
 
-    One rotation: all robots turn left every frame until each has gone through a full circle.
-    Random targets are drawn from the seed too. Raises ConfigError when the robots do not fit.
+    In a rotation all robots turn left every frame until each has completed a circle. Random targets
+    are drawn from the seed too. Raises ConfigError if the robots do not fit.
     """
     rng = np.random.default_rng(seed)
     num_turns = math.ceil(360 / config.turn_deg)
@@ -47,18 +47,18 @@ def test_starts(config: ArenaConfig, num: int, seed: int) -> tuple[Start, ...]:
 def _place(
     config: ArenaConfig, obstacles: Float64Array, rng: np.random.Generator, num_turns: int
 ) -> Float64Array:
-    """Poses [K, 3] that stay clear while all robots turn left for num_turns frames."""
+    """Draws poses [K, 3] that stay clear while all robots turn left for num_turns frames."""
     for _ in range(_RESTARTS):
         poses = np.empty((config.num_robots, 3))
         paths = np.empty((config.num_robots, num_turns + 1, 2))
         for i in range(config.num_robots):
             candidates = _random_poses(config, rng)
-            ways = _circle_paths(config, candidates, num_turns)
-            clear = _clear(config, ways, paths[:i], obstacles)
+            circles = _circle_paths(config, candidates, num_turns)
+            clear = _clear(config, circles, paths[:i], obstacles)
             if not clear.any():
                 break
             chosen = int(clear.argmax())
-            poses[i], paths[i] = candidates[chosen], ways[chosen]
+            poses[i], paths[i] = candidates[chosen], circles[chosen]
         else:
             return poses
     raise ConfigError(
@@ -68,7 +68,7 @@ def _place(
 
 
 def _random_poses(config: ArenaConfig, rng: np.random.Generator) -> Float64Array:
-    """Candidates [C, 3]."""
+    """Draws candidate poses [C, 3]."""
     low, high = reachable_px(config)
     least = np.array([low, low, -np.pi])
     span = np.array([high, high, np.pi]) - least
@@ -76,7 +76,7 @@ def _random_poses(config: ArenaConfig, rng: np.random.Generator) -> Float64Array
 
 
 def _circle_paths(config: ArenaConfig, poses: Float64Array, num_turns: int) -> Float64Array:
-    """Places [C, num_turns + 1, 2] of poses [C, 3] that turn left every frame."""
+    """Paths [C, num_turns + 1, 2] of robots that turn left every frame from poses [C, 3]."""
     if not num_turns:
         return poses[:, None, :2]
     turns = np.arange(1, num_turns + 1) * math.radians(config.turn_deg)
@@ -87,14 +87,14 @@ def _circle_paths(config: ArenaConfig, poses: Float64Array, num_turns: int) -> F
 
 
 def _clear(
-    config: ArenaConfig, ways: Float64Array, placed: Float64Array, obstacles: Float64Array
+    config: ArenaConfig, paths: Float64Array, placed: Float64Array, obstacles: Float64Array
 ) -> BoolArray:
-    """Which ways [C, T, 2] keep off walls, obstacles and the placed ways [P, T, 2]; [C]."""
+    """Mask [C] of paths [C, T, 2] that keep off walls, obstacles and the placed [P, T, 2]."""
     low, high = reachable_px(config)
-    inside = ((ways >= low) & (ways <= high)).all(axis=(1, 2))
+    inside = ((paths >= low) & (paths <= high)).all(axis=(1, 2))
     if len(obstacles) or config.inner_walls_px:
-        inside &= (room_px(config, ways, obstacles) >= 0).all(axis=1)
-    gaps = ways[:, None] - placed[None]
+        inside &= (clearance_px(config, paths, obstacles) >= 0).all(axis=1)
+    gaps = paths[:, None] - placed[None]
     apart = (gaps * gaps).sum(axis=3) >= (2 * config.robot_radius_px) ** 2
     clear: BoolArray = np.logical_and(inside, apart.all(axis=(1, 2)))
     return clear

@@ -1,6 +1,6 @@
 """The eight symmetries of the square, as they act on images, actions and scenes.
 
-Invariants: transpose comes first, then the flips; image and scene are mapped alike, so that
+Invariants: the transpose comes first, then the flips. Images and scenes are mapped alike, so that
 the image of the mapped scene is the mapped image of the scene.
 """
 
@@ -17,17 +17,17 @@ from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float64Array, UInt8Ar
 class Symmetry:
     """One of the 8 symmetries of the arena about its centre."""
 
-    transpose: bool  # x and y change places
-    flip_x: bool  # left and right change places
-    flip_y: bool  # top and bottom change places
+    transpose: bool  # swaps x and y
+    flip_x: bool  # swaps left and right
+    flip_y: bool  # swaps top and bottom
 
     @property
     def mirrors(self) -> bool:
-        """Whether it turns left into right, so that the actions must be swapped."""
+        """Whether it maps left turns to right turns, so that actions must be swapped."""
         return self.transpose ^ self.flip_x ^ self.flip_y
 
     def apply_to_images(self, images: UInt8Array) -> UInt8Array:
-        """Images [..., V, V] as the mapped scene would show them; a contiguous copy."""
+        """Maps images [..., V, V]; returns a contiguous copy."""
         if self.transpose:
             images = images.swapaxes(-1, -2)
         if self.flip_x:
@@ -37,11 +37,11 @@ class Symmetry:
         return np.array(images, order="C")
 
     def apply_to_actions(self, actions: UInt8Array) -> UInt8Array:
-        """Actions [...] that do in the mapped scene what the given ones did."""
+        """Maps actions [...] to those that do the same in the mapped scene."""
         return (NUM_ACTIONS - 1 - actions).astype(np.uint8) if self.mirrors else actions.copy()
 
     def apply_to_points(self, points: Float64Array, size_px: float) -> Float64Array:
-        """Points [N, 2] px of an arena of size_px, mapped."""
+        """Maps points [N, 2] px of an arena of size_px."""
         x, y = points.T
         if self.transpose:
             x, y = y, x
@@ -50,7 +50,7 @@ class Symmetry:
         )
 
     def apply_to_scene(self, scene: Scene, size_px: float) -> Scene:
-        """The scene of an arena of size_px, mapped."""
+        """Maps the scene of an arena of size_px."""
         headings = scene.robots[:, 2]
         if self.transpose:
             headings = np.pi / 2 - headings

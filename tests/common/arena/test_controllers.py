@@ -1,4 +1,4 @@
-"""Controllers that see the true state: what each promises, and that all of them mostly succeed."""
+"""Controllers that see the true state: the properties of each, and that they mostly succeed."""
 
 import math
 from itertools import permutations
@@ -8,26 +8,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrcdrl.common.arena import Arena, ArrayPhysics, Scene
-from mrcdrl.common.arena.controllers import CONTROLLERS, SafeCircle, controller, greedy_actions
+from mrcdrl.common.arena import Arena, Scene
+from mrcdrl.common.arena.controllers import CONTROLLERS, SafeCircle, greedy_actions, make_controller
 from mrcdrl.common.arena.controllers.heading import actions_towards, shortest_assignment
 from mrcdrl.common.arena.world import starts
 from mrcdrl.common.arena.world.obstacles import reachable_px
+from mrcdrl.common.arena.world.physics import ArrayPhysics
 from mrcdrl.common.arena.world.rewards import target_distances_px
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome
-
-TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])
+from tests.common.arena.shared import NO_OBSTACLES, TARGETS
 
 
 def outcomes(name: str, config: ArenaConfig, episodes: int, epsilon: float = 0) -> list[Outcome]:
-    """Of the paper's test."""
+    """Plays the paper's test and returns how its episodes end."""
     rng = np.random.default_rng(0)
     game = Arena(config, rng, max_collisions=1)
     ended = []
     for start in starts.test_starts(config, episodes, seed=0):
-        play = controller(name, config, rng)
+        play = make_controller(name, config, rng)
         step = game.reset(start)
         while not step.last:
             actions = play(game.scene)
@@ -43,7 +43,7 @@ def test_a_controller_gives_an_action_to_every_robot(name: str) -> None:
     for num_robots in (1, 3):
         config = ArenaConfig(num_robots=num_robots)
         game = Arena(config, np.random.default_rng(0))
-        play = controller(name, config, np.random.default_rng(0))
+        play = make_controller(name, config, np.random.default_rng(0))
         game.reset()
         for _ in range(5):
             game.step(play(game.scene))
@@ -52,18 +52,18 @@ def test_a_controller_gives_an_action_to_every_robot(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("clever", "there are random, greedy, potential_field, orca, safe_circle"),
+        ("clever", "choose from random, greedy, potential_field, orca, safe_circle"),
         ("safe-circle", "did you mean safe_circle"),
         ("potential", "did you mean potential_field"),
-        ("", "there are random"),
+        ("", "choose from random"),
     ],
 )
-def test_an_unknown_controller_is_refused_with_the_nearest(name: str, message: str) -> None:
+def test_an_unknown_controller_is_refused_with_the_closest_match(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        controller(name, ArenaConfig(), np.random.default_rng(0))
+        make_controller(name, ArenaConfig(), np.random.default_rng(0))
 
 
-def test_greedy_goes_to_free_targets() -> None:
+def test_greedy_heads_for_free_targets() -> None:
     robots = np.array([[170.0, 100, 0], [180.0, 500, 0]])
     nearer = greedy_actions(Scene(robots, TARGETS), ArenaConfig())
     assert nearer.tolist() == [2, 0]  # one to (175, 300), below it; one to (425, 300), above
@@ -97,7 +97,7 @@ def test_the_assignment_is_the_shortest_of_all(seed: int, num_robots: int, power
     assert costs[np.arange(num_robots), chosen].sum() == pytest.approx(min(every))
 
 
-def test_of_squares_the_robot_in_the_way_goes_on() -> None:
+def test_with_squares_the_robot_in_the_way_takes_the_farther_target() -> None:
     scene = Scene(
         np.array([[100.0, 300, 0], [200.0, 300, 0]]), np.array([[210.0, 300], [400, 300]])
     )
@@ -118,20 +118,20 @@ def test_the_action_that_turns_nearest(heading: float, wanted: float, action: in
     seed=st.integers(0, 2**32 - 1),
     sides=st.tuples(st.sampled_from([-1, 1]), st.sampled_from([-1, 1])),
 )
-def test_room_is_the_least_gap_of_circling_for_ever(seed: int, sides: tuple[int, int]) -> None:
+def test_gaps_are_the_least_while_circling_forever(seed: int, sides: tuple[int, int]) -> None:
     config = ArenaConfig()
     rng = np.random.default_rng(seed)
     poses = np.concatenate([rng.uniform(240, 360, (2, 2)), rng.uniform(-4, 4, (2, 1))], axis=1)
     poses[0, 0] = rng.uniform(0, 240)  # the wall may be nearer than the other
-    room = SafeCircle(config).room(poses[:1], np.array(sides[:1]), poses[1:], np.array(sides[1:]))
+    gaps = SafeCircle(config).gaps(poses[:1], np.array(sides[:1]), poses[1:], np.array(sides[1:]))
     least = least_gap(config, poses, np.array(sides))
-    assert room[0] <= least + 1e-9
+    assert gaps[0] <= least + 1e-9
     if math.dist(poses[0, :2], poses[1, :2]) > 30:  # else one circles within the other
-        assert room[0] == pytest.approx(least, abs=0.2)
+        assert gaps[0] == pytest.approx(least, abs=0.2)
 
 
 def least_gap(config: ArenaConfig, poses: Float64Array, sides: Float64Array) -> float:
-    """Of the first robot, by 720 frames of circling."""
+    """Least gap of the first robot in 720 frames of circling."""
     turns = np.arange(1, 721)[:, None] * sides * math.radians(config.turn_deg)
     headings = poses[:, 2] + turns
     ways = config.step_px * np.stack([np.cos(headings), np.sin(headings)], axis=2).cumsum(axis=0)
@@ -145,23 +145,23 @@ def least_gap(config: ArenaConfig, poses: Float64Array, sides: Float64Array) -> 
 @pytest.mark.parametrize(
     "settings", [{"num_obstacles": 3}, {"inner_walls_px": ((300, 200, 300, 400),)}]
 )
-def test_controllers_play_among_obstacles_or_say_that_they_cannot(
+def test_controllers_play_among_obstacles_or_refuse(
     settings: dict[str, object],
 ) -> None:
     config = ArenaConfig.model_validate({"max_frames": 400, **settings})
     rng = np.random.default_rng(0)
     for name in CONTROLLERS:
         if name in ("orca", "safe_circle"):
-            with pytest.raises(ConfigError, match=f"{name}.* no obstacles"):
-                controller(name, config, rng)
+            with pytest.raises(ConfigError, match=f"{name}.* not support obstacles"):
+                make_controller(name, config, rng)
         else:
-            controller(name, config, rng)
-    with pytest.raises(ConfigError, match=r"safe_circle.* may fail"):
-        controller("safe_circle", ArenaConfig(failure_probability=0.1), rng)
+            make_controller(name, config, rng)
+    with pytest.raises(ConfigError, match=r"safe_circle.* robots that fail"):
+        make_controller("safe_circle", ArenaConfig(failure_probability=0.1), rng)
     game = Arena(config, rng, max_collisions=1)
     wins = 0
     for start in starts.test_starts(config, 20, seed=0):
-        play = controller("potential_field", config, rng)
+        play = make_controller("potential_field", config, rng)
         step = game.reset(start)
         while not step.last:
             step = game.step(play(game.scene))
@@ -172,7 +172,7 @@ def test_controllers_play_among_obstacles_or_say_that_they_cannot(
 def test_circling_stays_on_its_circle() -> None:
     config = ArenaConfig(num_robots=1)
     physics = ArrayPhysics(config, 1)
-    physics.place(0, np.array([[300.0, 300.0, 0.3]]), np.empty((0, 3)))
+    physics.place(0, np.array([[300.0, 300.0, 0.3]]), NO_OBSTACLES)
     places = []
     for _ in range(360):
         physics.move(np.array([0]), np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.bool_))

@@ -1,4 +1,4 @@
-"""The counting arena: every number can be computed again, and no torn image passes."""
+"""The counting arena: every number can be recomputed, and torn images are detected."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_everything_is_a_function_of_identity_episode_and_step() -> None:
     assert len(outcomes) == 12
 
 
-def test_a_torn_image_is_found() -> None:
+def test_a_torn_image_is_detected() -> None:
     codec = make_codec(CONFIG)
     game = CountingArena(CONFIG)
     before = codec.decode(game.reset().records)

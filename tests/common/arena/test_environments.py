@@ -1,9 +1,6 @@
-"""The arena as PettingZoo and Gymnasium know it: their own tests, and what they do not test."""
+"""The arena in PettingZoo and Gymnasium: their own tests, and what those do not cover."""
 
 import hashlib
-import importlib.util
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +15,15 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo import test as pettingzoo_tests
 from pettingzoo.utils import BaseWrapper
 
-from mrcdrl.common.arena import Start, make_codec
+from mrcdrl.common.arena import make_codec
 from mrcdrl.common.arena.envs import parallel_env, vector_env
 from mrcdrl.common.arena.envs.vector_env import ENV_ID, ArenaVectorEnv
 from mrcdrl.common.arena.world import starts
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import UInt8Array
+from tests.common.arena.shared import example, in_another_process, start
 
 SMALL = ArenaConfig(num_robots=2, view_px=32, max_frames=40)
-TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])
-EXAMPLE = Path(__file__).parents[3] / "examples" / "parallel_env.py"
-
-
-def start(*robots: tuple[float, float, float]) -> Start:
-    return Start(np.array(robots), TARGETS)
 
 
 # -- their own tests ---------------------------------------------------------------------
@@ -43,11 +35,11 @@ def test_pettingzoo_accepts_the_parallel_form(num_robots: int) -> None:
     pettingzoo_tests.parallel_api_test(parallel_env.parallel_env(config), num_cycles=100)
 
 
-def test_pettingzoo_accepts_the_form_one_by_one() -> None:
+def test_pettingzoo_accepts_the_aec_form() -> None:
     pettingzoo_tests.api_test(parallel_env.env(SMALL), num_cycles=100)
 
 
-def test_pettingzoo_finds_it_seeded() -> None:
+def test_pettingzoo_finds_the_parallel_form_seeded() -> None:
     pettingzoo_tests.parallel_seed_test(lambda: parallel_env.parallel_env(SMALL), num_cycles=50)
 
 
@@ -60,13 +52,13 @@ def test_pettingzoo_accepts_the_images(capsys: pytest.CaptureFixture[str]) -> No
         return parallel_env.env(SMALL, render_mode=render_mode)
 
     pettingzoo_tests.render_test(make)
-    assert "▀" in capsys.readouterr().out  # `human` draws in the terminal
+    assert "▀" in capsys.readouterr().out  # `human` renders in the terminal
 
 
 def test_pettingzoo_saves_the_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its test takes one image, not a stack: the newest."""
+    """PettingZoo's test takes one image, not a stack, so it gets the newest."""
 
     class Newest(BaseWrapper):  # type: ignore[misc]
         def observation_space(self, agent: str) -> Box:
@@ -88,13 +80,13 @@ def test_pettingzoo_saves_the_images(
 
 
 def test_pettingzoo_measures_its_performance(capsys: pytest.CaptureFixture[str]) -> None:
-    """Five seconds, over many ends and resets; the figure is nobody's verdict."""
+    """Runs five seconds with many ends and resets; the rate itself is not checked."""
     pettingzoo_tests.performance_benchmark(parallel_env.env(SMALL))
     assert "turns per second" in capsys.readouterr().out
 
 
 class OneRobot(gymnasium.Env[UInt8Array, np.int64]):
-    """The vector form's only robot as a single environment, which Gymnasium's checker takes."""
+    """A vector environment of one robot as the single environment that the checker takes."""
 
     def __init__(self) -> None:
         self._envs = ArenaVectorEnv(1, ArenaConfig(num_robots=1, view_px=32))
@@ -147,7 +139,7 @@ def test_gymnasiums_wrappers_accept_the_vector_form() -> None:
 # -- the parallel form -------------------------------------------------------------------
 
 
-def test_a_state_is_the_last_images_and_the_first_repeated() -> None:
+def test_a_state_is_the_newest_images_with_the_first_repeated() -> None:
     env = parallel_env.parallel_env(SMALL)
     codec = make_codec(SMALL)
     before, _ = env.reset(seed=1)
@@ -193,7 +185,7 @@ def test_an_end_is_terminated_or_truncated(
 
 
 def test_misuse_of_the_parallel_form_is_refused() -> None:
-    with pytest.raises(ValueError, match="there are human and rgb_array"):
+    with pytest.raises(ValueError, match="is not human or rgb_array"):
         parallel_env.parallel_env(SMALL, render_mode="window")
     with pytest.raises(ValueError, match="max_frames"):
         parallel_env.parallel_env(SMALL, max_cycles=0)
@@ -251,9 +243,9 @@ def test_robots_of_the_vector_form_see_what_those_of_the_parallel_form_see() -> 
 
 
 def test_misuse_of_the_vector_form_is_refused() -> None:
-    with pytest.raises(ValueError, match="num_envs 3 makes no whole arenas of 2 robots"):
+    with pytest.raises(ValueError, match="num_envs 3 does not fill arenas of 2 robots"):
         ArenaVectorEnv(3, SMALL)
-    with pytest.raises(ValueError, match="there is rgb_array"):
+    with pytest.raises(ValueError, match="is not rgb_array"):
         ArenaVectorEnv(2, SMALL, render_mode="human")
     envs = ArenaVectorEnv(None, SMALL)
     assert envs.render() is None
@@ -266,7 +258,7 @@ def test_misuse_of_the_vector_form_is_refused() -> None:
 
 
 def fingerprint() -> str:
-    """A hash of 1 000 seeded steps of both forms; the same in another process."""
+    """Hashes 1 000 seeded steps of both forms."""
     config = ArenaConfig(num_robots=3, view_px=32, target_layout="random", max_frames=300)
     total = hashlib.sha256()
     rng = np.random.default_rng(3)
@@ -290,15 +282,7 @@ def fingerprint() -> str:
 
 
 def test_a_seed_gives_the_same_1000_steps_in_another_process() -> None:
-    code = (
-        "import importlib.util as u; "
-        f"s = u.spec_from_file_location('environments', {__file__!r}); "
-        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.fingerprint())"
-    )
-    other = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=100
-    )
-    assert other.stdout.strip() == fingerprint()
+    assert in_another_process(__file__, "fingerprint()") == fingerprint()
 
 
 def test_test_starts_can_be_played() -> None:
@@ -310,12 +294,6 @@ def test_test_starts_can_be_played() -> None:
 
 
 def test_the_example_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(EXAMPLE.read_text("utf-8").splitlines()) <= 30
-    spec = importlib.util.spec_from_file_location("example", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    example.main(str(tmp_path / "film.gif"), max_cycles=5)
+    example("parallel_env.py", 30).main(str(tmp_path / "film.gif"), max_cycles=5)
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF89a")
     assert "after 5 frames" in capsys.readouterr().out

@@ -1,8 +1,6 @@
-"""Whole episodes: outcomes, discounts, refused misuse, and the same play from the same seed."""
+"""Whole episodes: outcomes, discounts, refused misuse, and identical play from one seed."""
 
 import hashlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -19,19 +17,15 @@ from mrcdrl.common.arena import (
     make_arenas,
     make_codec,
 )
-from mrcdrl.common.arena.controllers import controller
+from mrcdrl.common.arena.controllers import make_controller
 from mrcdrl.common.arena.world import starts
-from mrcdrl.common.arena.world.obstacles import room_px
+from mrcdrl.common.arena.world.obstacles import clearance_px
 from mrcdrl.common.config import ArenaConfig, load_config
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Outcome, StepType
+from tests.common.arena.shared import TARGETS, in_another_process, start
 
 GO = np.ones(2, np.uint8)
-TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])
-
-
-def start(*robots: tuple[float, float, float]) -> Start:
-    return Start(np.array(robots), TARGETS)
 
 
 def arena(max_collisions: int | None = None, **settings: object) -> Arena:
@@ -73,7 +67,7 @@ def test_collisions_of_all_robots_end_an_episode(
     assert step.collided.all()
 
 
-def test_a_time_out_is_truncated_not_terminated() -> None:
+def test_a_timeout_is_truncated_not_terminated() -> None:
     game = arena(max_frames=4)
     game.reset(start((100, 100, 0), (100, 500, 0)))
     steps = [game.step(GO) for _ in range(4)]
@@ -174,7 +168,7 @@ def test_a_batch_plays_what_its_arenas_would_play_alone(physics: str) -> None:
 
 
 @pytest.mark.parametrize("physics", ["array", "pymunk"])
-def test_robots_that_fail_stand_and_the_last_one_goes_on(physics: str) -> None:
+def test_failed_robots_stand_still_and_the_last_one_never_fails(physics: str) -> None:
     batch = ArenaBatch(
         ArenaConfig.model_validate(
             {"num_robots": 4, "failure_probability": 0.05, "physics": physics, "max_frames": 200}
@@ -225,20 +219,20 @@ def test_the_hard_preset_can_be_played(num_robots: int) -> None:
         for index in ended:
             batch.reset(index)
             scene = batch.scene(index)
-            assert (room_px(config, scene.robots[:, :2], scene.obstacles) >= 0).all()
+            assert (clearance_px(config, scene.robots[:, :2], scene.obstacles) >= 0).all()
         steps = batch.step(rng.integers(0, 3, (4, num_robots)))
         assert codec.decode(steps.records).shape == (4, num_robots, 60, 60)
         ended = [index for index, outcome in enumerate(steps.outcomes) if outcome is not None]
 
 
 def fingerprint(physics: str) -> str:
-    """A hash of 1 000 seeded steps; the same in another process and with the other physics."""
+    """Hashes 1 000 seeded steps."""
     base = {"num_robots": 4, "target_layout": "random", "max_collisions": 20}
     config = ArenaConfig.model_validate({**base, "physics": physics})
     rng = np.random.default_rng(7)
     game = Arena(config, rng)
     codec = make_codec(config)
-    play = controller("random", config, rng)
+    play = make_controller("random", config, rng)
     total = hashlib.sha256()
     step = game.reset()
     for _ in range(1000):
@@ -252,15 +246,8 @@ def fingerprint(physics: str) -> str:
 
 
 def test_a_seed_gives_the_same_play_in_another_process_and_by_pymunk() -> None:
-    code = (
-        "import importlib.util as u; "
-        f"s = u.spec_from_file_location('episodes', {__file__!r}); "
-        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.fingerprint('array'))"
-    )
-    other = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert other.stdout.strip() == fingerprint("array") == fingerprint("pymunk")
+    there = in_another_process(__file__, "fingerprint('array')")
+    assert there == fingerprint("array") == fingerprint("pymunk")
 
 
 @settings(max_examples=16)

@@ -1,4 +1,4 @@
-"""The collision rule as a table, and what must hold of any play."""
+"""The collision rule as a table, and properties of any play."""
 
 import math
 
@@ -11,30 +11,28 @@ from mrcdrl.common.arena import (
     LEFT,
     RIGHT,
     STRAIGHT,
-    ArrayPhysics,
     Layout,
-    Physics,
-    PymunkPhysics,
     Scene,
     Start,
     Symmetry,
     training_start,
 )
-from mrcdrl.common.arena.world.obstacles import obstacles_for, reachable_px, room_px
+from mrcdrl.common.arena.world.obstacles import clearance_px, obstacles_for, reachable_px
+from mrcdrl.common.arena.world.physics import ArrayPhysics, Physics
+from mrcdrl.common.arena.world.pymunk_physics import PymunkPhysics
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, UInt8Array
+from tests.common.arena.shared import NO_OBSTACLES
 
 TURN = math.radians(23)
 EAST, SOUTH, WEST, NORTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 GO = STRAIGHT
 
-
-NO_OBSTACLES = np.empty((0, 3))
 PHYSICS = {"array": ArrayPhysics, "pymunk": PymunkPhysics}
 
 
 class World:
-    """One arena's robots, moved by the physics that the configuration names."""
+    """The robots of one arena, moved by the configured physics."""
 
     def __init__(
         self, config: ArenaConfig, robots: Float64Array, obstacles: Float64Array = NO_OBSTACLES
@@ -93,7 +91,7 @@ def test_a_robot_turns_and_then_moves(physics: str, action: int, heading: float)
         ([(200, 300, EAST), (254.9, 300, WEST)], [True, True]),
         ([(200, 300, EAST), (250, 300, EAST)], [False, False]),
         ([(200, 300, EAST), (250, 300, SOUTH)], [True, True]),
-        # one that flees is not caught, though its old place would be
+        # a robot that drives away is not hit, though its old place would be
         ([(200, 300, WEST), (250, 300, WEST)], [False, False]),
         # a chain: the wall stops the first, whose old place stops the second, and so on
         ([(37, 300, WEST), (87, 300, WEST), (137, 300, WEST)], [True, True, True]),
@@ -164,7 +162,7 @@ def test_obstacles_stop_robots(
     assert arena.hit_wall.tolist() == [blocked]
 
 
-def test_a_failed_robot_stands_and_stops_others(physics: str) -> None:
+def test_a_failed_robot_stands_still_and_stops_others(physics: str) -> None:
     arena = world((200, 300, EAST), (252, 300, WEST), (300, 500, EAST), physics=physics)
     arena.failed = np.array([False, True, False])
     assert arena.move(actions(GO, LEFT, GO)).tolist() == [True, False, False]
@@ -204,7 +202,7 @@ OBSTRUCTED = {
 
 
 def crowd(seed: int, **settings: object) -> tuple[ArenaConfig, Start, np.random.Generator]:
-    """A full arena, in which there is no lack of collisions."""
+    """Makes a crowded arena, in which robots collide often."""
     config = ArenaConfig.model_validate({"num_robots": 5, "size_px": 270, **settings})
     rng = np.random.default_rng(seed)
     layout = Layout(np.zeros((5, 2)), obstacles_for(config, np.empty((0, 2)), rng))
@@ -220,7 +218,7 @@ def clear(config: ArenaConfig, robots: Float64Array, obstacles: Float64Array) ->
         (gaps >= 2 * config.robot_radius_px - 1e-9).all()
         and (places >= low - 1e-9).all()
         and (places <= high + 1e-9).all()
-        and (room_px(config, places, obstacles) >= -1e-9).all()
+        and (clearance_px(config, places, obstacles) >= -1e-9).all()
     )
 
 
@@ -284,7 +282,7 @@ def test_a_mapped_world_gives_the_mapped_outcome(
 def by_the_rule(
     config: ArenaConfig, robots: Float64Array, moves: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
-    """The rule written down once more, without pymunk."""
+    """Applies the rule in an independent implementation, without pymunk."""
     turned = robots.copy()
     turned[:, 2] += (moves - 1) * math.radians(config.turn_deg)
     ways = np.stack([np.cos(turned[:, 2]), np.sin(turned[:, 2])], axis=1)
@@ -332,7 +330,7 @@ def test_collisions_are_what_the_rule_says(physics: str) -> None:
     offset=st.sampled_from([10.0, 0.0, 3.7]),
     bare=st.booleans(),
 )
-def test_the_array_is_pymunk_to_the_bit(
+def test_array_physics_equals_pymunk_to_the_bit(
     seed: int, num_robots: int, back_off: int, step: float, turn: float, offset: float, bare: bool
 ) -> None:
     fixed = {} if bare else OBSTRUCTED
@@ -352,7 +350,7 @@ def test_the_array_is_pymunk_to_the_bit(
     for arena in (0, 1):
         obstacles = obstacles_for(config, np.empty((0, 2)), rng)
         robots = training_start(config, Layout(np.empty((0, 2)), obstacles), rng).robots
-        robots[:, 2] *= rng.choice([1, 5])  # headings are given as anyone likes
+        robots[:, 2] *= rng.choice([1, 5])  # headings need not be wrapped
         one.place(arena, robots, obstacles)
         other.place(arena, robots, obstacles)
     failed = np.zeros((2, num_robots), np.bool_)

@@ -1,4 +1,4 @@
-"""The reward table of arena.md, with numbers worked out by hand; success as it is defined."""
+"""The paper's rewards with numbers worked out by hand, and the definition of success."""
 
 from itertools import permutations
 
@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrcdrl.common.arena import Scene, frame_rewards
-from mrcdrl.common.arena.world.rewards import on_target_px
+from mrcdrl.common.arena import Scene
+from mrcdrl.common.arena.world.rewards import frame_rewards, on_target_px
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import BoolArray, Float32Array
 
@@ -22,14 +22,14 @@ def scene(*places: tuple[float, float], targets: list[tuple[float, float]] = TAR
     return Scene(robots, np.array(targets))
 
 
-def judged(
+def rewarded(
     scene: Scene,
     collided: BoolArray,
     frame: int,
     config: ArenaConfig,
     failed: BoolArray | None = None,
 ) -> tuple[Float32Array, bool]:
-    """frame_rewards of one arena."""
+    """Applies frame_rewards to one arena."""
     failed = np.zeros(len(collided), np.bool_) if failed is None else failed
     stacked = Scene(scene.robots[None], scene.targets[None])
     frames = np.array([frame])
@@ -37,7 +37,7 @@ def judged(
     return rewards[0], bool(success[0])
 
 
-def test_on_is_nearer_than_the_printed_root() -> None:
+def test_on_target_is_nearer_than_the_printed_root() -> None:
     assert on_target_px(ArenaConfig()) == pytest.approx(42.72, abs=0.002)
 
 
@@ -72,7 +72,7 @@ def test_rewards(
     expected: list[float],
     success: bool,
 ) -> None:
-    rewards, done = judged(scene(*places), np.array(collided), frame, ArenaConfig())
+    rewards, done = rewarded(scene(*places), np.array(collided), frame, ArenaConfig())
     assert rewards.dtype == np.float32
     np.testing.assert_allclose(rewards, expected, atol=1e-4)
     assert done is success
@@ -81,22 +81,22 @@ def test_rewards(
 @pytest.mark.parametrize(
     ("places", "success"),
     [
-        # within 20 px: robot 0 of A, B; robot 1 of A; robot 2 of C: 0 must leave A to 1
+        # within 20 px: robot 0 has A and B, robot 1 A, robot 2 C: 0 must leave A to 1
         ([(110, 100), (90, 100), (150, 100)], True),
-        # robots 0 and 1 only of A, though each of the three targets has a robot near
+        # robots 0 and 1 have only A, though each of the three targets has a robot near
         ([(95, 100), (90, 100), (135, 100)], False),
     ],
 )
 def test_success_finds_a_target_for_each(places: list[tuple[float, float]], success: bool) -> None:
     targets = [(100.0, 100.0), (125.0, 100.0), (150.0, 100.0)]
     config = ArenaConfig(num_robots=3)
-    _, done = judged(scene(*places, targets=targets), np.zeros(3, np.bool_), 1, config)
+    _, done = rewarded(scene(*places, targets=targets), np.zeros(3, np.bool_), 1, config)
     assert done is success
 
 
 @settings(max_examples=300)
 @given(seed=st.integers(0, 2**32 - 1), num_robots=st.integers(1, 4), spare=st.integers(0, 3))
-def test_success_is_all_within_delta_of_targets_of_their_own(
+def test_success_is_all_within_delta_of_distinct_targets(
     seed: int, num_robots: int, spare: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ def test_success_is_all_within_delta_of_targets_of_their_own(
     robots = np.concatenate([rng.permutation(places), np.zeros((num_robots, 1))], axis=1)
     collided = rng.random(num_robots) < 0.05
     failed = rng.random(num_robots) < 0.2
-    rewards, success = judged(Scene(robots, targets), collided, 1, config, failed)
+    rewards, success = rewarded(Scene(robots, targets), collided, 1, config, failed)
     near = np.linalg.norm(robots[:, None, :2] - targets, axis=2) < config.success_radius_px
     each = np.flatnonzero(~failed)
     seated = any(near[each, list(o)].all() for o in permutations(range(num_targets), len(each)))

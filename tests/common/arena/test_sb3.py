@@ -1,7 +1,4 @@
-"""The arena as stable-baselines3 knows it: ends, states and seeds; and the example trains."""
-
-import importlib.util
-from pathlib import Path
+"""The arena in stable-baselines3: ends, states and seeds; and the example trains."""
 
 import numpy as np
 import pytest
@@ -11,9 +8,9 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 from mrcdrl.common.arena.envs.parallel_env import ArenaParallelEnv
 from mrcdrl.common.arena.envs.sb3 import ArenaVecEnv
 from mrcdrl.common.config import ArenaConfig
+from tests.common.arena.shared import example
 
 SHORT = ArenaConfig(num_robots=2, view_px=32, max_frames=3)
-EXAMPLE = Path(__file__).parents[3] / "examples" / "sb3_dqn.py"
 
 
 def test_robots_see_and_get_what_those_of_the_parallel_form_do() -> None:
@@ -26,10 +23,10 @@ def test_robots_see_and_get_what_those_of_the_parallel_form_do() -> None:
     np.testing.assert_array_equal(states[:3], np.stack(list(observed.values())))
     for _ in range(10):
         states, rewards, ends, infos = envs.step(np.array([0, 1, 2, 0, 0, 0]))
-        observed, paid, _, _, told = env.step({"robot_0": 0, "robot_1": 1, "robot_2": 2})
+        observed, paid, _, _, expected = env.step({"robot_0": 0, "robot_1": 1, "robot_2": 2})
         np.testing.assert_array_equal(states[:3], np.stack(list(observed.values())))
         np.testing.assert_array_equal(rewards[:3], np.array(list(paid.values()), np.float32))
-        assert infos[:3] == list(told.values())
+        assert infos[:3] == list(expected.values())
         assert not ends.any()
 
 
@@ -45,11 +42,11 @@ def test_the_end_brings_the_next_start_and_the_last_state() -> None:
         assert [info["outcome"] for info in infos] == ["timeout"] * 2
         last = np.stack([info["terminal_observation"] for info in infos])
         np.testing.assert_array_equal(last[:, :-1], before[:, 1:])
-        assert (states == states[:, :1]).all(), "a first image, repeated"
+        assert (states == states[:, :1]).all(), "the first image is repeated"
         assert (states != last).any()
 
 
-def test_a_seed_holds_for_one_reset() -> None:
+def test_a_seed_applies_to_one_reset() -> None:
     envs = ArenaVecEnv(2, SHORT)
     envs.seed(1)
     first, second = envs.reset(), envs.reset()
@@ -58,7 +55,7 @@ def test_a_seed_holds_for_one_reset() -> None:
     np.testing.assert_array_equal(first, envs.reset())
 
 
-def test_what_is_asked_of_robots_is_asked_of_their_arenas() -> None:
+def test_attributes_and_methods_of_robots_are_those_of_their_arenas() -> None:
     envs = ArenaVecEnv(2, SHORT, render_mode="rgb_array")
     envs.reset()
     assert envs.get_attr("render_mode", indices=[0, 3]) == ["rgb_array"] * 2
@@ -70,18 +67,12 @@ def test_what_is_asked_of_robots_is_asked_of_their_arenas() -> None:
     np.testing.assert_array_equal(first, second)
     assert (first != third).any()
     envs.close()
-    with pytest.raises(ValueError, match="num_arenas 0: at least 1"):
+    with pytest.raises(ValueError, match="num_arenas 0 is not at least 1"):
         ArenaVecEnv(0)
 
 
 def test_the_example_trains(capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(EXAMPLE.read_text("utf-8").splitlines()) <= 35
-    spec = importlib.util.spec_from_file_location("example", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    model = example.main(400, buffer_size=500, learning_starts=100)
+    model = example("sb3_dqn.py", 35).main(400, buffer_size=500, learning_starts=100)
     assert model.num_timesteps >= 400
     assert model._n_updates > 0
     assert "episodes succeeded" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Noise and dropped frames: what a record says is all that there is to see."""
+"""Noise and dropped frames, which a record determines completely."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ SCENE = Scene(np.array([[200.0, 300, 1], [400, 200, 2]]), np.array([[175.0, 300]
 
 
 def records_of(config: ArenaConfig, frames: int = 40) -> UInt8Array:
-    """Records [frames, K, R] of seeded play."""
+    """Plays with a seed and returns records [frames, K, R]."""
     rng = np.random.default_rng(5)
     game = Arena(config, rng)
     records = [game.reset().records]
@@ -35,7 +35,7 @@ def test_noise_has_its_mean_and_deviation_and_follows_the_seed() -> None:
     assert abs(np.corrcoef(noise[0, :, 1:].ravel(), noise[0, :, :-1].ravel())[0, 1]) < 0.02
 
 
-def test_noise_is_cut_off_at_black_and_white() -> None:
+def test_noise_is_clipped_at_black_and_white() -> None:
     views = np.stack([np.zeros((60, 60), np.uint8), np.full((60, 60), 255, np.uint8)])
     add_noise(views, np.zeros(2, np.uint32), 20.0)
     assert (views[0] == 0).mean() == pytest.approx(0.5, abs=0.05)
@@ -43,7 +43,7 @@ def test_noise_is_cut_off_at_black_and_white() -> None:
 
 
 def splitmix(state: int) -> int:
-    """The generator once more, in Python's integers."""
+    """The generator again, in Python's integers."""
     state = (state ^ (state >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
     state = (state ^ (state >> 27)) * 0x94D049BB133111EB % 2**64
     return state ^ (state >> 31)
@@ -83,14 +83,14 @@ def test_both_codecs_show_the_same_noise_and_the_same_drops(renderer: str) -> No
     assert 0.4 < fresh.mean() < 0.95
 
 
-def test_a_dropped_frame_is_the_record_before_of_that_robot() -> None:
+def test_a_dropped_frame_repeats_the_previous_record_of_that_robot() -> None:
     plain = records_of(ArenaConfig(max_collisions=1000))
     settings: dict[str, Any] = {"max_collisions": 1000, "dropped_frame_probability": 0.25}
     seen = records_of(ArenaConfig.model_validate(settings))
     np.testing.assert_array_equal(seen[0], plain[0])
     dropped = (seen != plain).any(axis=2)
     assert 0.1 < dropped.mean() < 0.4
-    assert (dropped.sum(axis=1) == 1).any()  # each robot for itself
+    assert (dropped.sum(axis=1) == 1).any()  # robots drop frames independently
     for frame, robot in zip(*np.nonzero(dropped), strict=True):
         np.testing.assert_array_equal(seen[frame, robot], seen[frame - 1, robot])
 

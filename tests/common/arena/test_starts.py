@@ -8,21 +8,21 @@ import pytest
 
 from mrcdrl.common.arena import (
     LEFT,
-    ArrayPhysics,
     Layout,
     Scene,
     Symmetry,
-    fixed_layout,
     layout_for,
     layout_symmetries,
     training_start,
 )
 from mrcdrl.common.arena.world import starts
-from mrcdrl.common.arena.world.obstacles import room_px
+from mrcdrl.common.arena.world.layout import fixed_layout
+from mrcdrl.common.arena.world.obstacles import clearance_px
+from mrcdrl.common.arena.world.physics import ArrayPhysics
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.errors import ConfigError
+from tests.common.arena.shared import NO_OBSTACLES
 
-NO_OBSTACLES = np.empty((0, 3))
 NONE_FAILED = np.zeros((1, 10), np.bool_)
 
 
@@ -100,9 +100,9 @@ def test_random_obstacles_leave_room_to_pass_and_to_stand(layout: str) -> None:
             if i:
                 assert min(place) - 12 - radius >= 60
                 assert 588 - max(place) - radius >= 60
-        assert (room_px(config, drawn.targets, drawn.obstacles) >= 5).all()
+        assert (clearance_px(config, drawn.targets, drawn.obstacles) >= 5).all()
         robots = training_start(config, drawn, rng).robots
-        assert (room_px(config, robots[:, :2], drawn.obstacles) >= 0).all()
+        assert (clearance_px(config, robots[:, :2], drawn.obstacles) >= 0).all()
 
 
 def test_test_starts_keep_off_obstacles_for_a_rotation() -> None:

@@ -1,4 +1,4 @@
-"""Images: the analytic renderer against OpenCV, symmetries, and what any bytes give."""
+"""Images: the analytic renderer against OpenCV, symmetries, and records of any bytes."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ def views(config: ArenaConfig, scene: Scene) -> UInt8Array:
 
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
 @pytest.mark.parametrize("crop_px", [60, 149, 150, 200, 300, 600, 1200])
-def test_analytic_is_what_opencv_draws(crop_px: int, orientation: str) -> None:
+def test_the_analytic_renderer_agrees_with_opencv(crop_px: int, orientation: str) -> None:
     config = ArenaConfig.model_validate(
         {
             "num_robots": 4,
@@ -51,8 +51,8 @@ def test_analytic_is_what_opencv_draws(crop_px: int, orientation: str) -> None:
 
 
 @pytest.mark.parametrize("crop_px", [150, 201, 330])
-def test_an_unrotated_window_cuts_out_whole_pixels(crop_px: int) -> None:
-    """So that what fills whole pixels itself, walls and targets, is as in the literal steps."""
+def test_an_unrotated_window_crops_whole_pixels(crop_px: int) -> None:
+    """Checks that walls and targets, which fill whole pixels, equal the literal steps."""
     config = ArenaConfig(num_robots=1, crop_px=crop_px)
     rng = np.random.default_rng(0)
     across = (np.arange(60) + 0.5) * crop_px / 60 - crop_px / 2
@@ -65,7 +65,7 @@ def test_an_unrotated_window_cuts_out_whole_pixels(crop_px: int) -> None:
 
 
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
-def test_analytic_draws_obstacles_as_opencv_does(orientation: str) -> None:
+def test_the_analytic_renderer_agrees_with_opencv_on_obstacles(orientation: str) -> None:
     config = ArenaConfig.model_validate({**OBSTRUCTED, "orientation": orientation})
     pairs = [(views(config, s), literal_views(s, config)) for s in scenes(config, 60)]
     errors = np.array([one.astype(int) - other for one, other in pairs])
@@ -73,7 +73,7 @@ def test_analytic_draws_obstacles_as_opencv_does(orientation: str) -> None:
     assert abs(errors.mean()) < 0.1
 
 
-def test_an_obstacle_has_its_own_grey() -> None:
+def test_an_obstacle_has_its_own_intensity() -> None:
     config = ArenaConfig(num_robots=1, obstacles_px=((300, 200, 30),))
     scene = Scene(
         np.array([[300.0, 300, 0]]), np.array([[500.0, 500]]), np.array([[300.0, 200, 30]])
@@ -93,12 +93,12 @@ def test_an_inner_wall_covers_its_area() -> None:
     assert (image == (0, 0, 255)).all(axis=2).sum() == pytest.approx(2 * 125, rel=0.15)
 
 
-def test_a_image_by_hand() -> None:
-    """One robot in the middle of its arena, heading east; a pixel is 10 px."""
+def test_an_image_by_hand() -> None:
+    """Compares a robot in the middle that heads east with numbers by hand; a pixel is 10 px."""
     config = ArenaConfig(num_robots=1, targets_px=((455, 305),), robot_radius_px=30)
     view = views(config, Scene(np.array([[300.0, 300.0, 0.0]]), np.array([[455.0, 305.0]])))[0]
     assert view[0].max() == 0
-    np.testing.assert_array_equal(view[1, 2:58], [15] * 56)  # 2 of 10 px of grey 76
+    np.testing.assert_array_equal(view[1, 2:58], [15] * 56)  # 2 of 10 px of intensity 76
     np.testing.assert_array_equal(view[2:58, 58], [15] * 56)
     np.testing.assert_array_equal(view[29:32, 44:47], np.full((3, 3), 29))
     assert view[28:33, 43:48].sum() == 9 * 29
@@ -109,7 +109,7 @@ def test_a_image_by_hand() -> None:
     assert view[27:33, 27:33].sum() == pytest.approx(255 * white, rel=2e-3)
 
 
-def test_heading_up_puts_ahead_at_the_top() -> None:
+def test_heading_up_shows_what_is_ahead_at_the_top() -> None:
     config = ArenaConfig(num_robots=1, targets_px=((300, 400),), orientation="heading_up")
     for heading, where in [(np.pi / 2, (20, 30)), (0.0, (30, 40)), (np.pi, (30, 20))]:
         robots = np.array([[300.0, 300.0, heading]])
@@ -134,7 +134,7 @@ def test_the_mapped_scene_gives_the_mapped_image(symmetry: Symmetry, num_obstacl
 
 
 @pytest.mark.parametrize("symmetry", SYMMETRIES)
-def test_heading_up_knows_mirrors_only(symmetry: Symmetry) -> None:
+def test_heading_up_maps_only_mirrors(symmetry: Symmetry) -> None:
     config = ArenaConfig(num_robots=4, target_layout="random", orientation="heading_up")
     mirror = Symmetry(transpose=False, flip_x=symmetry.mirrors, flip_y=False)
     for scene in scenes(config, 20):
@@ -245,7 +245,7 @@ def test_any_size_of_image(view_px: int, crop_px: float) -> None:
             assert views(config, scene).shape == (2, view_px, view_px)
 
 
-def test_draw_arena_paints_the_paper_colours() -> None:
+def test_render_arena_uses_the_paper_colours() -> None:
     scene = Scene(np.array([[300.0, 300.0, 0.0]]), np.array([[100.0, 200.0]]))
     image = render_arena(scene, ArenaConfig(num_robots=1))
     assert image.shape == (600, 600, 3)
