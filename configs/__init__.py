@@ -1,1 +1,1 @@
-"""Presets: `--config NAME` finds them here."""
+"""The presets that `--config NAME` finds, and the router's configuration."""
