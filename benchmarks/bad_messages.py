@@ -1,10 +1,10 @@
-"""A real replay service is sent bad messages on all its keys, and a good one among each fifty.
+"""Send bad messages to a real replay service on all its keys, with one good one in fifty.
 
-`python -m benchmarks.bad_messages --count 100000` starts a replay process, sends it malformed,
+`python -m benchmarks.bad_messages --count 100000` starts a replay process and sends it malformed,
 truncated, flipped, spliced, foreign, ill-fitting and oversized messages over Zenoh, also with
 their arrays after the map, and in sets. It prints one line of JSON: how many of each kind were
-refused, that all were counted, the reasons, messages/s, and the memory of the process (VmRSS) on
-the way. tests/system/test_bad_messages.py sends a few thousand.
+refused, how many replay counted, the reasons, messages/s, and the memory of the process (VmRSS)
+over time. tests/system/test_bad_messages.py sends a few thousand.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from tests.system.system_processes import Command, end_all, eventually, run_name
 
 IN_FLIGHT = 32
 GOOD_EVERY = 50
-WARM_UP = 1000  # messages before the memory is looked at first
+WARM_UP = 1000  # messages before the first look at the memory
 LARGEST = 200_000  # bytes of a message
 CONFIG = load_config(
     "smoke",
@@ -64,9 +64,9 @@ def main() -> None:
 
 
 def flood(count: int, seed: int, folder: Path) -> dict[str, Any]:
-    """Send so many to a replay process of its own; what came of it.
+    """Start a replay process, send it that many messages, and return the figures.
 
-    Raises AssertionError for a message that was not refused, and where a good one was.
+    Raises AssertionError if a bad message is not refused, or a good one is.
     """
     name, endpoint = run_name("bad-messages"), free_endpoint()
     path = folder / "bad.toml"
@@ -84,7 +84,7 @@ def flood(count: int, seed: int, folder: Path) -> dict[str, Any]:
 
 
 class Peer:
-    """Sends bad and good messages, a few at a time, and keeps account of the answers."""
+    """Sends bad and good messages, a few at a time, and counts the answers."""
 
     def __init__(self, session: Session, keys: Keys, seed: int, pid: int) -> None:
         self._stats = session.queue_subscriber(keys.every_stats)
@@ -144,13 +144,13 @@ class Peer:
         self._ask(cls, "good", encode(message))
 
     def _settle(self, most: int) -> None:
-        """Wait for answers until no more than so many are under way."""
+        """Wait for answers until at most `most` requests are in flight."""
         while len(self._pending) > most:
             kind, payload, reply = self._pending.popleft()
             try:
                 reply.result()
             except ThrottledError as error:
-                raise AssertionError(f"{kind} message held: {error}") from error
+                raise AssertionError(f"{kind} message throttled: {error}") from error
             except RefusedError as error:
                 if kind == "good":
                     raise AssertionError(f"a good message was refused: {error}") from error
@@ -161,7 +161,7 @@ class Peer:
                 self._good += 1
 
     def _heard(self, metric: str, at_least: int) -> int:
-        """Replay's own figure, as soon as it is as large."""
+        """Replay's own figure, once it is that large."""
 
         def look() -> float | None:
             item = self._stats.take(1.0)
@@ -176,7 +176,7 @@ class Peer:
 
 
 def _answers(session: Session, keys: Keys) -> bool:
-    """Whether replay is up: it answers when its log is read back."""
+    """Whether replay is up: it answers once it has read its log back."""
     try:
         return bool(session.client(keys.config, "replay", timeout_s=1.0).ask(b"").result())
     except DeadlineError:
@@ -184,7 +184,7 @@ def _answers(session: Session, keys: Keys) -> bool:
 
 
 def _form(reason: str) -> str:
-    """A reason without the numbers in it, so that alike ones are counted together."""
+    """A reason with its digits replaced, so that similar ones are counted together."""
     return "".join("9" if c.isdigit() else c for c in reason.removeprefix("replay refused: "))[:60]
 
 
@@ -211,7 +211,7 @@ def example(cls: type, sequence: int = 0, config: Config = CONFIG) -> Any:
 
 
 def bad(cls: type, kind: str, rng: random.Random) -> bytes:
-    """A message of that kind for whom expects `cls`; never one that could be taken."""
+    """A bad message of that kind for a receiver of `cls`; never one that could be taken."""
     if kind == "oversized":
         return rng.randbytes(rng.randint(LARGEST + 1, 2 * LARGEST))
     while True:
@@ -221,7 +221,7 @@ def bad(cls: type, kind: str, rng: random.Random) -> bytes:
 
 
 def could_be_taken(cls: type, payload: bytes) -> bool:
-    """Whether the change did no harm, or none that can be told."""
+    """Whether the change did no harm, or none that shows."""
     try:
         parts = split_set(payload) if cls is Chunk else [payload]
         return all(_fits(decode(cls, part)) for part in parts)
@@ -230,7 +230,7 @@ def could_be_taken(cls: type, payload: bytes) -> bool:
 
 
 def _fits(message: Any) -> bool:
-    """Whether a sound message is of the run's arena, agent and batch size."""
+    """Whether a valid message fits the run's arena, agent and batch size."""
     if isinstance(message, SampleRequest):
         return 1 <= message.batch_size <= CONFIG.learner.sample_size
     if isinstance(message, Chunk):
@@ -253,14 +253,14 @@ def _flip(message: bytes, rng: random.Random) -> bytes:
 
 
 def _apart(cls: type, rng: random.Random) -> bytes:
-    """Arrays after the map, and something of it flipped or away."""
+    """Arrays after the map, with bits flipped or the end cut off."""
     with mock.patch.object(wire, "_LARGE_BYTES", 1):
         data = encode(example(cls))
     return _flip(data, rng) if rng.random() < 0.5 else data[: rng.randrange(len(data))]
 
 
 def _set(cls: type, rng: random.Random) -> bytes:
-    """One of several is bad, or their head lies."""
+    """A set with one bad message, or with a wrong head."""
     good, other = [encode(example(cls, 2**40))], [_flip(encode(example(cls)), rng)]
     message = b"".join(join_set([good, other] if rng.random() < 0.5 else [good, good]))
     return message if rng.random() < 0.5 else _flip(message[:16], rng) + message[16:]
@@ -281,7 +281,7 @@ def _foreign(cls: type, rng: random.Random) -> bytes:
 
 
 def _misfit(cls: type, rng: random.Random) -> bytes:
-    """Well-formed, and of another arena, agent or batch size."""
+    """A well-formed message of another arena, agent or batch size."""
     message = example(cls)
     if cls is SampleRequest:
         return encode(SampleRequest(rng.choice((0, -1, CONFIG.learner.sample_size + 1, 2**62))))
@@ -304,7 +304,7 @@ def _misfit(cls: type, rng: random.Random) -> bytes:
 
 
 def _odd(cls: type, rng: random.Random) -> bytes:
-    """One field is of another kind, or away, or there is one more."""
+    """A message with a field of another kind, a missing field or an extra one."""
     table = msgpack.unpackb(encode(example(cls)))
     name = rng.choice(list(table))
     odd = (None, True, -1, 2**64 - 1, 1.5, "a", b"a", [], {}, [[], b"\1"], [[2**40, 2**40], b""])

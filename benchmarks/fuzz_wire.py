@@ -1,10 +1,10 @@
-"""Coverage-guided fuzzing of `decode`, for all messages: only WireError ever comes out.
+"""Fuzz `decode` for all messages, guided by coverage: it may raise nothing but WireError.
 
-`python -m benchmarks.fuzz_wire --minutes 10` runs libFuzzer (by Atheris, `pip install atheris`) in
-a process of its own, begins with a valid message of each class, and prints one line of JSON:
-executions, executions/s, coverage (edges of the bytecode of wire.py and framing.py, and
-features), findings. Sets of messages are taken apart too. What is taken must also encode to the
-same again. Exit code 1 where there is a finding.
+`python -m benchmarks.fuzz_wire --minutes 10` runs libFuzzer (Atheris, `pip install atheris`) in its
+own process, starting from a valid message of each class, and prints one line of JSON: executions,
+executions/s, coverage (edges of the bytecode of wire.py and framing.py, and features), findings.
+Sets of messages are split too. A decoded message must also encode to the same bytes again. Exits
+with 1 if there is a finding.
 """
 
 import argparse
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def watch(folder: Path, minutes: float, seed: int) -> dict[str, Any]:
-    """Run the fuzzer, and say what it said."""
+    """Run the fuzzer and return its figures."""
     corpus = folder / "corpus"
     corpus.mkdir()
     for number, message in enumerate(examples()):
@@ -89,11 +89,11 @@ def watch(folder: Path, minutes: float, seed: int) -> dict[str, Any]:
          f"-artifact_prefix={folder}/finding-"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    said = ended.stdout + ended.stderr
-    stats = dict(_STAT.findall(said))
+    output = ended.stdout + ended.stderr
+    stats = dict(_STAT.findall(output))
     if not stats:
-        raise SystemExit(said)
-    edges, features, corpus_size = (int(n) for n in _DONE.findall(said)[-1])
+        raise SystemExit(output)
+    edges, features, corpus_size = (int(n) for n in _DONE.findall(output)[-1])
     findings = [path.read_bytes().hex() for path in sorted(folder.glob("finding-*"))]
     return {
         "bench": "fuzz_wire",
@@ -105,15 +105,15 @@ def watch(folder: Path, minutes: float, seed: int) -> dict[str, Any]:
         "features": features,
         "corpus": corpus_size,
         "peak_rss_mb": int(stats["peak_rss_mb"]),
-        "errors": _ERROR.findall(said),
+        "errors": _ERROR.findall(output),
         "findings": findings,
     }
 
 
 def examples() -> list[bytes]:
-    """A valid message of every class, its class's number before it, and sets of chunks.
+    """A valid message of every class, after its class's number, and sets of chunks.
 
-    Each once with its arrays in the map and once with them after it.
+    Each appears once with its arrays in the map and once with them after it.
     """
     from mrcdrl.common.messages import wire
     from mrcdrl.common.messages.trajectory import Chunk
@@ -129,7 +129,7 @@ def examples() -> list[bytes]:
 
 
 def example(cls: type) -> Any:
-    """A message of a class, made of ones in arrays of two."""
+    """A message of a class, of ones in arrays of two."""
     from dataclasses import fields
     from typing import get_args, get_origin, get_type_hints
 
@@ -159,13 +159,13 @@ def example(cls: type) -> Any:
 
 
 def fuzz(arguments: list[str]) -> int:
-    """In the process of its own: libFuzzer's loop, which ends the process."""
+    """Run libFuzzer's loop, which ends the process."""
     try:
         import atheris
     except ImportError:
         raise SystemExit("fuzz_wire needs Atheris: pip install atheris") from None
     names = ["mrcdrl.common.messages.framing", "mrcdrl.common.messages.wire"]
-    for name in names:  # to be read again, with what counts edges
+    for name in names:  # imported again below, instrumented to count edges
         sys.modules.pop(name, None)
     with atheris.instrument_imports(include=names):
         from mrcdrl.common.messages import framing, wire
@@ -186,7 +186,7 @@ def fuzz(arguments: list[str]) -> int:
         for message in messages:
             again = wire.encode(message)
             if wire.encode(wire.decode(cls, again)) != again:
-                raise AssertionError(f"a {cls.__name__} does not come back as it was")
+                raise AssertionError(f"a {cls.__name__} does not encode to the same bytes again")
 
     def mutate(data: bytes, max_size: int, seed: int) -> bytes:
         rng = random.Random(seed)
@@ -199,7 +199,7 @@ def fuzz(arguments: list[str]) -> int:
 
 
 def structured(data: bytes, rng: random.Random) -> bytes | None:
-    """A message with something odd in one place of its map; None where the bytes are no map."""
+    """A message with one odd value in its map; None if the bytes are not a map."""
     try:
         in_map, arrays = split_map(memoryview(data[1:]))
         table = msgpack.unpackb(in_map, strict_map_key=False)

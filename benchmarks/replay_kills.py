@@ -1,14 +1,15 @@
-"""kill -9 of a replay service at random moments under load: what it acknowledged is there again.
+"""Kill a replay service at random moments under load, and check that it loses nothing.
 
 `python -m benchmarks.replay_kills --kills 50` runs a replay process, two that insert counting
-chunks and one that samples and sets priorities, kills the first again and again, each fifth time
-while it still reads its log, and starts it again. In the end it looks for every acknowledged
-chunk in the log. Prints one line of JSON; exit code 1 where one was lost, doubled or moved.
+chunks and one that samples and sets priorities. It kills the first again and again (kill -9), every
+fifth time while it is still reading its log, and restarts it. At the end it looks for every
+acknowledged chunk in the log. Prints one line of JSON; exits with 1 if a chunk was lost, doubled or
+moved.
 
-A restart lasts from the start of the process until it serves, by its log. On a machine that does
-other things as well, most of that may be waiting for a core: `with_a_core_s` is without it, as
-Linux counts it (schedstat), `processor_s` what was computed. Peers find the service again a little
-later, when Zenoh tries the next time: `answered_s`, to the first answer that this process gets.
+A restart lasts from the start of the process until its log says that it serves. On a busy machine
+most of that may be waiting for a core: `with_a_core_s` leaves this out, as Linux counts it
+(schedstat), and `processor_s` is the processor time. Peers find the service a little later, when
+Zenoh tries again: `answered_s` lasts until this process gets its first answer.
 """
 
 import argparse
@@ -44,7 +45,7 @@ from tests.system.system_processes import (
 )
 
 WRITERS = ("actor-0", "actor-1")
-DURING_RECOVERY = 5  # each so-manieth kill comes before the service is up
+DURING_RECOVERY = 5  # one kill in so many comes before the service is up
 CONFIG = {
     "arena.num_robots": "4",
     "actor.chunk_length": "50",
@@ -63,7 +64,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--capacity", type=int, default=400_000)
-    parser.add_argument("--longest", type=float, default=4.0, help="seconds up before a kill")
+    parser.add_argument("--longest", type=float, default=4.0, help="most seconds before a kill")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = ordeal(
@@ -74,7 +75,7 @@ def main() -> int:
 
 
 def ordeal(folder: Path, kills: int, seed: int, capacity: int, longest_s: float) -> dict[str, Any]:
-    """Kill, start again, and count what is there in the end."""
+    """Kill and restart, then count what the log holds."""
     config = load_config("smoke", {**CONFIG, "replay.capacity": str(capacity)}, environ={})
     (folder / "kills.toml").write_text(to_toml(config), "utf-8")
     name, rng = run_name("kills"), random.Random(seed)
@@ -110,15 +111,15 @@ def ordeal(folder: Path, kills: int, seed: int, capacity: int, longest_s: float)
         "processor_s": spread(service.processor, 2),
         "over_5_s": sum(s > 5 for s in service.restarts),
         "with_a_core_over_5_s": sum(s > 5 for s in service.with_a_core),
-        "torn_tails": service.said("torn tail"),
-        "snapshots_ignored": service.said("ignored"),
-        "tracebacks": service.said("Traceback"),
+        "torn_tails": service.logged("torn tail"),
+        "snapshots_ignored": service.logged("ignoring"),
+        "tracebacks": service.logged("Traceback"),
     }
 
 
 @dataclass
 class Service:
-    """The replay process, one after the other."""
+    """The replay process and its successors."""
 
     folder: Path
     run: str
@@ -137,7 +138,7 @@ class Service:
         )
 
     def start(self, session: Session) -> None:
-        """Begin, and wait; the restart is measured."""
+        """Begin, wait, and measure the restart."""
         began_s = time.monotonic()
         self.begin()
         command = self.command
@@ -150,7 +151,7 @@ class Service:
         self.answers.append(time.monotonic() - began_s)
 
     def wait(self, session: Session) -> None:
-        """Until it answers."""
+        """Wait until it answers."""
         assert self.command is not None
         client = session.client(Keys(self.run).config, "replay", timeout_s=120.0)
         while True:
@@ -158,7 +159,7 @@ class Service:
                 raise AssertionError(self.command.err)
             try:
                 client.ask(b"").result()
-            except DeadlineError:  # at once, where nobody has declared to answer
+            except DeadlineError:  # at once, if no server is declared
                 time.sleep(0.02)
             else:
                 return
@@ -170,31 +171,31 @@ class Service:
         self.kills += 1
 
     def end(self) -> None:
-        """In order."""
+        """Stop it in order."""
         assert self.command is not None
         if self.command.end() != 0:
             raise AssertionError(self.command.err)
 
-    def said(self, word: str) -> int:
-        """Lines of all processes' logs with the word."""
+    def logged(self, word: str) -> int:
+        """Lines of all processes' logs that hold the word."""
         texts = (path.read_text("utf-8") for path in self.folder.glob("replay-*.err"))
         return sum(word in line for text in texts for line in text.splitlines())
 
 
 def _processor_s(pid: int) -> float:
-    """Seconds of the processor that a process has had."""
+    """Processor seconds of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _waited_s(pid: int) -> float:
-    """Seconds for which the main thread could have run, and no core was free."""
+    """Seconds for which the main thread could have run but no core was free."""
     return int(Path(f"/proc/{pid}/schedstat").read_text("utf-8").split()[1]) / 1e9
 
 
 @contextmanager
 def load(folder: Path, run: str, endpoint: str) -> Iterator[None]:
-    """Writers and a sampler, for as long as the block lasts; they end by themselves, and well."""
+    """Run writers and a sampler during the block; check that they end well."""
     common = ["--run", run, "--connect", endpoint, "--config", str(folder / "kills.toml")]
     roles = [["writer", "--actor", w, "--out", str(folder / f"{w}.acknowledged")] for w in WRITERS]
     processes = [
@@ -221,15 +222,14 @@ def load(folder: Path, run: str, endpoint: str) -> Iterator[None]:
 
 
 def compare(config: Config, contents: Contents, folder: Path) -> dict[str, Any]:
-    """What was acknowledged against what the log holds.
+    """Compare what was acknowledged with what the log holds.
 
-    lost: acknowledged, among the transitions that the table has not replaced, and not there.
-    moved: there under another key than was said, or not as it was sent. doubled: there twice.
-    placed: of the acknowledged, those whose key was said.
+    lost: acknowledged, not yet evicted from the table, and missing. moved: under another key than
+    acknowledged, or not as sent. doubled: present twice. placed: acknowledged with a key.
     """
     assert contents.rebuilt is not None
     oldest = contents.rebuilt.table.first_key
-    there = {
+    by_sequence = {
         (chunk.actor, chunk.sequence): (key, chunk)
         for key, chunk in zip(contents.keys, contents.chunks, strict=True)
     }
@@ -237,17 +237,17 @@ def compare(config: Config, contents: Contents, folder: Path) -> dict[str, Any]:
     for actor in WRITERS:
         *lines, last = (folder / f"{actor}.acknowledged").read_text("utf-8").splitlines()
         assert last == "done"
-        not_before = 0  # each comes after the one before it
+        not_before = 0  # keys of one actor increase
         for line in lines:
             sequence, key = (int(word) for word in line.split())
             acknowledged, placed = acknowledged + 1, placed + (key >= 0)
             not_before = max(not_before, key)
-            found = there.get((actor, sequence))
+            found = by_sequence.get((actor, sequence))
             if found is None:
                 lost += [f"{actor} {sequence}"] * (not_before >= oldest)
             elif key not in (-1, found[0]) or not _as_sent(config, found[1]):
                 moved.append(f"{actor} {sequence}")
-        newest = max(s for a, s in there if a == actor)
+        newest = max(s for a, s in by_sequence if a == actor)
         unasked += newest - (len(lines) - 1)
     files = contents.files
     return {
@@ -255,9 +255,9 @@ def compare(config: Config, contents: Contents, folder: Path) -> dict[str, Any]:
         "transitions": acknowledged * config.actor.chunk_length,
         "placed": placed,
         "lost": lost[:20],
-        "doubled": files.duplicate_chunks + len(contents.chunks) - len(there),
+        "doubled": files.duplicate_chunks + len(contents.chunks) - len(by_sequence),
         "moved": moved[:20],
-        "stored_unacknowledged": unasked,  # at most one request of each writer
+        "stored_unacknowledged": unasked,  # at most one request per writer
         "in_the_log": len(contents.chunks),
         "table_size": len(contents.rebuilt.table),
         "corrupt_records": files.corrupt_records,

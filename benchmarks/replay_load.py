@@ -1,11 +1,11 @@
-"""Load for a replay service: a process that inserts counting chunks, or one that samples them.
+"""Load a replay service with a process that inserts counting chunks, or one that samples them.
 
-`python -m benchmarks.replay_load writer|sampler --run NAME --connect ENDPOINT --config FILE` goes
-on until it is asked to stop, whatever becomes of the service. A counting chunk is a pure function
-of its actor and sequence, so that whoever finds it again knows what should be in it. A writer
-sends up to six at a time, as an actor's spool does, and notes each acknowledged one in `--out`, a
-line each: its sequence, and the key of its first transition, or -1 where the acknowledgement does
-not tell (of a request's last chunk it does, unless replay had it before); in the end, `done`.
+`python -m benchmarks.replay_load writer|sampler --run NAME --connect ENDPOINT --config FILE` runs
+until it is asked to stop, whatever happens to the service. A counting chunk is a pure function of
+its actor and sequence, so that a reader knows what it should hold. A writer sends up to six at a
+time, as an actor's spool does, and writes a line to `--out` for each acknowledged chunk: its
+sequence, and the key of its first transition, or -1 if unknown (the acknowledgement tells only the
+key of a request's last chunk, unless it is a duplicate). The last line is `done`.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
 
 _WARN_S = 60.0
-_MOST_CHUNKS = 6  # of one request
+_MOST_CHUNKS = 6  # in one request
 
 
 def main() -> int:
@@ -49,7 +49,7 @@ def main() -> int:
 def write(
     config: Config, session: Session, keys: Keys, actor: str, out: Path, stop: StopSignal
 ) -> None:
-    """Insert chunk after chunk, some together; they are sent until they are acknowledged."""
+    """Insert chunk after chunk, some together, each until it is acknowledged."""
     writer, incarnation, sequence = ReplayWriter(session, keys, _WARN_S, stop), time.time_ns(), 0
     rng = random.Random(actor)
     with out.open("w", encoding="utf-8", buffering=1) as acknowledged:
@@ -67,7 +67,7 @@ def write(
 
 
 def sample(config: Config, session: Session, keys: Keys, stop: StopSignal) -> None:
-    """Draw mini-batches, look whether they are whole, and give them new priorities."""
+    """Sample mini-batches, check that they are whole, and set new priorities."""
     reader = ReplayReader(session, keys, config.learner.batch_size, 2, 2, _WARN_S, stop)
     writer = PriorityWriter(session, keys, stop)
     rng = np.random.default_rng(0)
@@ -78,7 +78,7 @@ def sample(config: Config, session: Session, keys: Keys, stop: StopSignal) -> No
 
 
 def counting_chunk(config: Config, actor: str, incarnation: int, sequence: int) -> Chunk:
-    """Rewards count an actor's transitions, records repeat the count of their row."""
+    """A chunk whose rewards count its actor's transitions and whose records repeat the count."""
     length, tail = config.actor.chunk_length, config.arena.stack - 1 + config.agent.n_step
     first = sequence * length
     rows = (first + np.arange(length + tail)).astype("<u4")
@@ -98,7 +98,7 @@ def counting_chunk(config: Config, actor: str, incarnation: int, sequence: int) 
 
 
 def check_samples(config: Config, samples: Samples) -> None:
-    """Raise AssertionError where records, rewards and versions of a transition do not fit."""
+    """Raise AssertionError if records, rewards and versions of a transition do not match."""
     counts = samples.records.view("<u4")
     first = samples.weights_versions * config.actor.chunk_length
     window = counts[:, :1, :1] + np.arange(counts.shape[1])[:, None]

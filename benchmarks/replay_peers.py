@@ -1,10 +1,10 @@
-"""Our replay service and its peers, one after the other, round after round, on the same cores.
+"""Compare our replay service with its peers, in turn and in rounds, on the same cores.
 
     python -m benchmarks.replay_peers --peers DIR --cores 0,1 --reverb-python P --zmq-python P
 
-DIR is the folder of the harness, with `replay_reverb.py` and `replay_zmq.py`; each peer has a
-Python of its own with what it needs installed. Each system prints its line of JSON, round after
-round; then a table of medians goes to stderr, in thousand transitions a second.
+DIR is the directory of the harness, with `replay_reverb.py` and `replay_zmq.py`; each peer has its
+own Python with its requirements installed. Each system prints a line of JSON per round; then a
+table of medians goes to stderr, in thousands of transitions a second.
 """
 
 import argparse
@@ -59,19 +59,19 @@ def main() -> None:
         module = [sys.executable, "-m", "benchmarks.replay", "--peers", str(arguments.peers)]
         commands[name] = [*module, *timing, *OURS[name]]
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in commands}
-    for turn in range(arguments.rounds):
+    for number in range(arguments.rounds):
         for name, command in commands.items():
             result = run(["taskset", "-c", arguments.cores, *command])
-            print(json.dumps({"system": name, "round": turn, **result}), flush=True)
+            print(json.dumps({"system": name, "round": number, **result}), flush=True)
             found[name].append(result)
-            sys.stderr.write(f"round {turn}: {name}: {result.get('error', 'done')}\n")
+            sys.stderr.write(f"round {number}: {name}: {result.get('error', 'done')}\n")
     sys.stderr.write(table(found))
 
 
 def run(command: list[str], **variables: str) -> dict[str, Any]:
-    """The last line of JSON that the command prints; {"error"} where it prints none.
+    """The last line of JSON that the command prints; {"error"} if it prints none.
 
-    variables: of its environment, besides this process's.
+    variables: added to this process's environment.
     """
     environment = {**os.environ, **variables}
     ended = subprocess.run(
@@ -85,7 +85,7 @@ def run(command: list[str], **variables: str) -> dict[str, Any]:
 
 
 def table(found: dict[str, list[dict[str, Any]]]) -> str:
-    """Thousands a second, medians over the rounds."""
+    """A table of medians over the rounds, in thousands a second."""
     lines = [f"{'':24}" + "".join(f"{name:>18}" for name in COLUMNS)]
     for name, results in found.items():
         cells = (figure(results, key) for key in COLUMNS.values())

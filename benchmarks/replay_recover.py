@@ -1,8 +1,8 @@
-"""How long a replay service takes to read its log back: the table of a killed process, full.
+"""Time how long a replay service takes to read its log back after a kill, with a full table.
 
-Writes a log of random chunks once (4 robots, `--codec` scene or frames), then builds table, log
-and service `--repeats` times, as a start does. Prints one line of JSON: seconds on the clock and
-of the processor (median, min, max), with a snapshot of all priorities beside the log.
+Writes a log of random chunks once (4 robots, `--codec` scene or frames), with a snapshot of all
+priorities beside it, then builds table, log and service `--repeats` times, as a start does. Prints
+one line of JSON: wall-clock and processor seconds (median, min, max).
 """
 
 import argparse
@@ -16,17 +16,8 @@ from benchmarks.machine import emit, spread
 from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.messages.trajectory import Chunk
 from mrcdrl.common.messages.wire import encode
-from mrcdrl.services.replay.build import build, open_log
-from mrcdrl.services.replay.service import ReplayService
-
-
-class NoServer:
-    """Nobody asks."""
-
-    refused = 0
-
-    def take(self, timeout_s: float) -> None:
-        return None
+from mrcdrl.services.replay.log import open_log
+from tests.services.replay.harness import start
 
 
 def main() -> None:
@@ -67,7 +58,7 @@ def main() -> None:
 
 
 def fill(config: Config, directory: Path) -> None:
-    """The log of a full table, and a snapshot."""
+    """Write the log of a full table, and a snapshot."""
     log = open_log(config, directory)
     assert log is not None
     rng, length = np.random.default_rng(0), config.actor.chunk_length
@@ -87,25 +78,16 @@ def fill(config: Config, directory: Path) -> None:
         )
         log.append([encode(chunk)], number * length, length)
     log.close()
-    (directory / "snapshot").write_bytes(started(config, directory).snapshot().to_bytes())
+    (directory / "snapshot").write_bytes(start(directory, config).snapshot().to_bytes())
 
 
 def recover(config: Config, directory: Path) -> tuple[float, float]:
-    """Seconds on the clock and of the processor until the table is back."""
+    """Wall-clock and processor seconds until the table is back."""
     wall, processor = time.perf_counter(), time.process_time()
-    service = started(config, directory)
+    service = start(directory, config)
     taken = time.perf_counter() - wall, time.process_time() - processor
-    assert service.metrics()["size"] == config.replay.capacity
+    assert service.metrics().size > 0.9 * config.replay.capacity  # tails take rows, too
     return taken
-
-
-def started(config: Config, directory: Path) -> ReplayService:
-    """A service that has recovered; nothing of it runs."""
-    table, limiter = build(config)
-    log = open_log(config, directory)
-    service = ReplayService(config, table, limiter, NoServer(), NoServer(), NoServer(), log)
-    service.recover()
-    return service
 
 
 NONE = np.empty(0, np.float32)

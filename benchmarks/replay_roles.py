@@ -1,4 +1,4 @@
-"""What `benchmarks.replay` hands to the harness: our server, writer and sampler."""
+"""Our server, writer and sampler, as `benchmarks.replay` gives them to the harness."""
 
 import argparse
 import importlib
@@ -23,9 +23,11 @@ from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.actor.sender import Sender
 from mrcdrl.services.learner.priorities import PrioritiesSender
 from mrcdrl.services.learner.rendering import ThreadedDecoder
-from mrcdrl.services.replay.build import build, open_log
 from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter
+from mrcdrl.services.replay.limiter import RateLimiter
+from mrcdrl.services.replay.log import open_log
 from mrcdrl.services.replay.service import ReplayService
+from mrcdrl.services.replay.table import Table
 
 sys.path.insert(0, os.environ["MRCDRL_BENCH_HARNESS"])
 base: Any = importlib.import_module("peers_harness")
@@ -36,7 +38,7 @@ Arguments = argparse.Namespace
 
 
 def config_of(args: Arguments) -> Config:
-    """The configuration that makes our service what the harness asks for."""
+    """Our service's configuration for what the harness asks."""
     return Config.model_validate(
         {
             "arena": {
@@ -63,11 +65,11 @@ def session_of(args: Arguments, end: str) -> Session:
 
 
 class Server:
-    """Our service, which is the router too."""
+    """Our service, which is also the router."""
 
     def __init__(self, args: Arguments) -> None:
         config = config_of(args)
-        table, limiter = build(config)
+        table, limiter = Table.from_config(config), RateLimiter.from_config(config)
         self._folder = Path(tempfile.mkdtemp(prefix="bench-", dir=args.log_dir))
         self._log = open_log(config, self._folder)
         self._session = session_of(args, "listen")
@@ -86,7 +88,7 @@ class Server:
 
 
 class Writer(base.WriterBase):  # type: ignore[misc]
-    """The actor's sender and what is below it."""
+    """The actor's sender and the layers below it."""
 
     def setup(self) -> None:
         self._session = session_of(self.args, "connect")
@@ -96,7 +98,7 @@ class Writer(base.WriterBase):  # type: ignore[misc]
         self._sequence = self._sent = 0
 
     def _episode_records(self, episode: int) -> UInt8Array:
-        """All records of an episode, the first one repeated before it to fill the first state."""
+        """All records of an episode, with the first one repeated to fill the first state."""
         if self.args.codec == "frames":
             records = self.pool.frames[episode].reshape(base.T + 1, -1)
         else:
@@ -137,7 +139,7 @@ class Writer(base.WriterBase):  # type: ignore[misc]
 
 
 class Sampler(base.SamplerBase):  # type: ignore[misc]
-    """The learner's reader, and its sender of priorities."""
+    """The learner's reader and its sender of priorities."""
 
     def begin(self, batch_size: int) -> None:
         super().begin(batch_size)
@@ -157,9 +159,9 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
     def next(self) -> dict[str, Any]:
         samples = self._reader.sample()
         assert samples is not None
-        pictures = self._pictures(samples)
+        images = self._images(samples)
         batch: dict[str, Any] = base.as_batch(
-            pictures,
+            images,
             samples.actions,
             samples.rewards,
             samples.discounts,
@@ -168,14 +170,14 @@ class Sampler(base.SamplerBase):  # type: ignore[misc]
         )
         return batch
 
-    def _pictures(self, samples: Samples) -> UInt8Array:
-        """Pictures [B, W, V, V]; of codec `records` what is sampled."""
+    def _images(self, samples: Samples) -> UInt8Array:
+        """Images [B, W, V, V]; for codec `records`, the sampled records."""
         if self.args.codec == "frames":
             return samples.records.reshape(*samples.records.shape[:2], VIEW_PX, VIEW_PX)
         self._num_given += 1
         if self._num_given <= 3:
-            # Before it starts the clock the harness looks at shape, order and intensities of three
-            # batches: our arena is darker than its frames.
+            # Before it starts the clock, the harness checks the shape, order and intensities of
+            # three batches; our arena is darker than its frames.
             return self._decode(samples.records) // 2 + np.uint8(120)
         return self._decode(samples.records) if self.args.codec == "drawn" else samples.records
 

@@ -1,9 +1,9 @@
-"""A replay service at full load for a while: does its memory grow, and how long do requests take?
+"""Run a replay service at full load: does its memory grow, and how long do requests take?
 
 Starts `mrcdrl replay` and two processes that insert, and sample with priorities, as fast as they
-can. Once the table has been full twice, its memory is noted every few seconds. Prints one line of
-JSON: memory at the beginning, at the end and at most (proportional share, MiB), latencies of a
-request (milliseconds: median, p99, longest), and how much went through.
+can. Once the table has been filled twice, its memory is recorded every few seconds. Prints one line
+of JSON: memory at the beginning, the end and the maximum (proportional, MiB), request latencies
+(milliseconds: median, p99, maximum), and throughput.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--capacity", type=int, default=400_000)
     parser.add_argument("--codec", choices=["scene", "frames"], default="scene")
     parser.add_argument("--batch-size", type=int, default=32)
-    parser.add_argument("--log-dir", help="where the log goes; by default the system's")
+    parser.add_argument("--log-dir", help="directory for the log; default: the system's")
     arguments = parser.parse_args()
     config = load_config(
         "quick",
@@ -61,15 +61,15 @@ def main() -> None:
 
 
 def soak(config: Config, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """All figures."""
+    """Run the load and return all figures."""
     endpoint = free_endpoint()
     (folder / "config.toml").write_text(to_toml(config), "utf-8")
     command = [*COMMAND, "replay", "--run", RUN, "--listen", endpoint]
     command += ["--config", str(folder / "config.toml"), "--run-dir", str(folder)]
     spawn = multiprocessing.get_context("spawn")
-    stop, told = spawn.Event(), spawn.Queue()
+    stop, results = spawn.Event(), spawn.Queue()
     workers = [
-        spawn.Process(target=work, args=(name, config, endpoint, stop, told)) for name in WORK
+        spawn.Process(target=work, args=(name, config, endpoint, stop, results)) for name in WORK
     ]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as service:
         try:
@@ -77,7 +77,7 @@ def soak(config: Config, arguments: argparse.Namespace, folder: Path) -> dict[st
                 worker.start()
             memory = watch(service.pid, config, endpoint, arguments.minutes, workers)
             stop.set()
-            return {"memory_mib": memory, **dict(told.get(timeout=60) for _ in workers)}
+            return {"memory_mib": memory, **dict(results.get(timeout=60) for _ in workers)}
         finally:
             stop.set()
             service.terminate()
@@ -90,10 +90,10 @@ def work(
     config: Config,
     endpoint: str,
     stop: multiprocessing.synchronize.Event,
-    told: "multiprocessing.queues.Queue[tuple[str, dict[str, float]]]",
+    results: "multiprocessing.queues.Queue[tuple[str, dict[str, float]]]",
 ) -> None:
-    """One of WORK until told to stop; then its figures."""
-    told.put((name, WORK[name](config, endpoint, stop)))
+    """Run one of WORK until stopped, then send its figures."""
+    results.put((name, WORK[name](config, endpoint, stop)))
 
 
 def watch(
@@ -103,16 +103,16 @@ def watch(
     minutes: float,
     workers: Sequence[multiprocessing.process.BaseProcess],
 ) -> dict[str, float]:
-    """Memory of the service while it is at work, from the second time round its table on."""
+    """Memory of the service under load, from when its table has been filled twice."""
     transport = config.transport.model_copy(update={"connect": (endpoint,)})
     found: list[float] = []
     with Session(transport) as session:
-        told = session.queue_subscriber(Keys(RUN).every_stats)
+        stats = session.queue_subscriber(Keys(RUN).every_stats)
         inserts, due_s = 0.0, time.monotonic()
         while len(found) < max(2, 60 * minutes / PERIOD_S):
             if not all(worker.is_alive() for worker in workers):
-                raise MrcdrlError("a worker ended; its error is above")
-            item = told.take(1.0)
+                raise MrcdrlError("a worker has ended; its error is above")
+            item = stats.take(1.0)
             if item is not None:
                 inserts = decode(Stats, item[1]).metrics["inserts"]
             if inserts > 2 * config.replay.capacity and time.monotonic() >= due_s:
@@ -130,9 +130,9 @@ def watch(
 
 
 def memory_mib(process: int) -> float:
-    """Proportional share: memory that clients lend counts for a half.
+    """Proportional memory: a buffer shared with a client counts half.
 
-    Without mapped files: what libraries count for depends on how many others have them open.
+    Leaves out mapped files: a library's part depends on how many processes have it open.
     """
     rollup = Path(f"/proc/{process}/smaps_rollup").read_text("ascii")
     fields = dict(line.split()[:2] for line in rollup.splitlines()[1:])
@@ -142,7 +142,7 @@ def memory_mib(process: int) -> float:
 def insert(
     config: Config, endpoint: str, stop: multiprocessing.synchronize.Event
 ) -> dict[str, float]:
-    """Chunks until told to stop."""
+    """Insert chunks until stopped."""
     rng = np.random.default_rng(0)
     arena = config.arena
     shape = (arena.stack - 1 + LENGTH + config.agent.n_step, arena.record_bytes)
@@ -176,7 +176,7 @@ def insert(
 def sample(
     config: Config, endpoint: str, stop: multiprocessing.synchronize.Event
 ) -> dict[str, float]:
-    """Mini-batches one at a time, and their priorities, until told to stop."""
+    """Sample mini-batches one at a time and set their priorities, until stopped."""
     rng = np.random.default_rng(1)
     size = config.learner.batch_size
     seconds: list[float] = []
@@ -195,7 +195,7 @@ def sample(
 
 
 def latencies(seconds: list[float]) -> dict[str, float]:
-    """Milliseconds; the first hundred, in which all is set up, left out."""
+    """Milliseconds, without the first hundred requests, which set things up."""
     median, p99, longest = np.quantile(np.array(seconds[100:]) * 1000, [0.5, 0.99, 1.0])
     return {
         "p50_ms": round(float(median), 3),

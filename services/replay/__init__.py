@@ -1,1 +1,1 @@
-"""The replay service: keeps transitions, and hands out mini-batches of them."""
+"""The replay service: keeps transitions and serves mini-batches of them."""

@@ -1,13 +1,14 @@
-"""What others use of replay: actors, the learner, and who looks after them."""
+"""What other processes use of replay: actors, the learner, and their watchers."""
 
 import dataclasses
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.errors import DeadlineError, ThrottledError, WireError
 from mrcdrl.common.messages.framing import join_set
 from mrcdrl.common.messages.trajectory import (
@@ -22,8 +23,8 @@ from mrcdrl.common.messages.wire import decode, encode, encode_parts
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Client, PendingReply, Session
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.replay.build import table_bytes
-from mrcdrl.services.replay.shards import ShardStream, shard_of, shares
+from mrcdrl.services.replay.capacity import table_bytes
+from mrcdrl.services.replay.shards import ShardStream, shard_of, shard_probabilities
 
 __all__ = [
     "PriorityWriter",
@@ -37,14 +38,14 @@ __all__ = [
 _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2
 _LONGEST_RETRY_S = 3.2
-_LAST_ANSWER_S = 1.0  # for an answer under way when told to stop
+_LAST_ANSWER_S = 1.0  # wait for a pending answer after a stop
 
 
 class ReplayWriter:
-    """Inserts chunks; returns when replay has acknowledged, however often it must ask.
+    """Inserts chunks; returns when replay has acknowledged them, however often it must ask.
 
-    warn_s: without an acknowledgement for so long, a line of the log says so. shard: of
-    num_shards, the one that takes this actor's chunks.
+    warn_s: after so long without an acknowledgement, logs a warning. shard: of num_shards, the
+    one that takes this actor's chunks.
     """
 
     def __init__(
@@ -62,17 +63,26 @@ class ReplayWriter:
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
         self.throttled = 0
-        """Answers that said: not now."""
+        """Answers that said "not now"."""
         self.unanswered = 0
-        """Requests whose time was over, or that brought no reply one could read."""
+        """Requests that timed out or brought an unreadable reply."""
+
+    @classmethod
+    def from_config(
+        cls, session: Session, keys: Keys, config: Config, actor: str, stop: StopSignal
+    ) -> Self:
+        """The writer of an actor, to the shard that takes its chunks."""
+        num_shards = config.replay.shards
+        shard = shard_of(actor, num_shards)
+        return cls(session, keys, config.actor.warn_s, stop, shard=shard, num_shards=num_shards)
 
     @property
     def heard_s(self) -> float:
-        """When replay last answered, on the monotonic clock; at first, when it was first asked."""
+        """When replay last answered, on the monotonic clock; before that, when first asked."""
         return self._patience.since
 
     def insert(self, chunks: Sequence[Chunk]) -> InsertReply | None:
-        """The acknowledgement of all, at least one; None when stopped before it came.
+        """Insert one chunk or more; the acknowledgement of all, or None when stopped before.
 
         Raises RefusedError, with replay's reason, when asking again would not help.
         """
@@ -91,7 +101,7 @@ class ReplayWriter:
             except ThrottledError:
                 self.throttled += 1
                 self._patience.renew()
-                if time.monotonic() - asked_s < _RETRY_S:  # too many wait there already
+                if time.monotonic() - asked_s < _RETRY_S:  # too many requests are waiting
                     self._stop.wait(retry_s)
                     retry_s = min(2 * retry_s, _LONGEST_RETRY_S)
             except (DeadlineError, WireError):
@@ -105,10 +115,9 @@ class ReplayWriter:
 class ReplayReader:
     """Samples mini-batches from all shards, several requests ahead, several batches a request.
 
-    A reply is of one shard, drawn in proportion to the shards' total priorities; the
-    probabilities, the table size and the keys of its samples speak of all shards together. One
-    that is away or holds back, for which a sample has waited `late_s` in vain, is left out until
-    it answers.
+    A reply comes from one shard, chosen in proportion to the shards' total priorities; the
+    probabilities, table size and keys of its samples refer to all shards as one table. A shard
+    that is unreachable or throttles for `late_s` is left out until it answers.
     """
 
     def __init__(
@@ -126,8 +135,8 @@ class ReplayReader:
         late_s: float = _RETRY_S,
         learner_step: int | None = None,
     ) -> None:
-        """learner_step: of a run that takes turns, the steps made so far; then one request after
-        the other is for the steps that follow.
+        """learner_step: in lockstep, the steps made so far; requests then go out one at a time,
+        each for the steps that follow. None: not in lockstep.
         """
         self._batches_per_request = batches_per_request
         self._learner_step = -1 if learner_step is None else learner_step
@@ -148,13 +157,32 @@ class ReplayReader:
         self._late_s = late_s
         self._stop = stop
 
+    @classmethod
+    def from_config(
+        cls, session: Session, keys: Keys, config: Config, stop: StopSignal, learner_step: int = 0
+    ) -> Self:
+        """The learner's reader. learner_step: steps made so far, which matter in lockstep."""
+        learner = config.learner
+        return cls(
+            session,
+            keys,
+            learner.batch_size,
+            learner.sample_size // learner.batch_size,
+            learner.requests_in_flight,
+            learner.warn_s,
+            stop,
+            num_shards=config.replay.shards,
+            seed=learner.seed,
+            learner_step=learner_step if config.run.turn_size else None,
+        )
+
     def _request(self) -> bytes:
         size = self._batch_size * self._batches_per_request
         return encode(SampleRequest(size, self._learner_step))
 
     @property
     def heard_s(self) -> float:
-        """When replay last answered, on the monotonic clock; at first, when it was first asked."""
+        """When replay last answered, on the monotonic clock; before that, when first asked."""
         return self._patience.since
 
     def sample(self) -> Samples | None:
@@ -170,16 +198,16 @@ class ReplayReader:
         return batch
 
     def _next_batches(self) -> Iterator[Samples]:
-        """Those of the next reply; none where no shard had one in time."""
-        there = [s for s in self._shards if s.ready() or not s.late] or self._shards
-        share = shares([shard.total_priority for shard in there])
-        index = int(self._rng.choice(len(there), p=share)) if len(there) > 1 else 0
-        drawn = there[index]
-        if not drawn.ready(self._late_s):
-            drawn.late = True
+        """The mini-batches of the next reply; none if no shard replied in time."""
+        eligible = [s for s in self._shards if s.ready() or not s.late] or self._shards
+        probabilities = shard_probabilities([shard.total_priority for shard in eligible])
+        index = int(self._rng.choice(len(eligible), p=probabilities)) if len(eligible) > 1 else 0
+        chosen = eligible[index]
+        if not chosen.ready(self._late_s):
+            chosen.late = True
             return iter(())
         try:
-            samples = drawn.take()
+            samples = chosen.take()
         except ThrottledError:
             self._patience.renew()
             return iter(())
@@ -190,22 +218,23 @@ class ReplayReader:
         if self._learner_step >= 0:
             self._learner_step += self._batches_per_request
         if len(self._shards) > 1:
-            samples = self._of_all(samples, self._shards.index(drawn), float(share[index]))
+            shard = self._shards.index(chosen)
+            samples = self._as_one_table(samples, shard, float(probabilities[index]))
         return split_samples(samples, self._batch_size)
 
-    def _of_all(self, samples: Samples, shard: int, share: float) -> Samples:
-        """A shard's samples as those of the table that all shards are together."""
+    def _as_one_table(self, samples: Samples, shard: int, probability: float) -> Samples:
+        """A shard's samples as samples of the table that all shards form together."""
         return dataclasses.replace(
             samples,
             keys=samples.keys * len(self._shards) + shard,
-            probabilities=samples.probabilities * share,
+            probabilities=samples.probabilities * probability,
             table_size=sum(stream.table_size for stream in self._shards),
             total_priority=sum(stream.total_priority or 0.0 for stream in self._shards),
         )
 
 
 class PriorityWriter:
-    """Sets priorities; each is tried once, since a lost one does no harm."""
+    """Sets priorities; tries each message once, since a lost one does no harm."""
 
     def __init__(
         self, session: Session, keys: Keys, stop: StopSignal, *, num_shards: int = 1
@@ -216,20 +245,24 @@ class PriorityWriter:
         ]
         self._stop = stop
 
+    @classmethod
+    def from_config(cls, session: Session, keys: Keys, config: Config, stop: StopSignal) -> Self:
+        return cls(session, keys, stop, num_shards=config.replay.shards)
+
     def update(self, priorities: Priorities) -> PrioritiesReply | None:
-        """The acknowledgement; None where a shard is away or busy, or told to stop.
+        """The acknowledgement; None if a shard is unreachable or busy, or when stopped.
 
         Raises RefusedError, with replay's reason, when the message is wrong.
         """
         pending = [client.ask(encode(part)) for client, part in self._parts(priorities)]
         replies = [self._reply(asked) for asked in pending]
-        there = [reply for reply in replies if reply is not None]
-        if len(there) < len(replies):
+        received = [reply for reply in replies if reply is not None]
+        if len(received) < len(replies):
             return None
-        return PrioritiesReply(sum(r.updated for r in there), sum(r.ignored for r in there))
+        return PrioritiesReply(sum(r.updated for r in received), sum(r.ignored for r in received))
 
     def _parts(self, priorities: Priorities) -> Iterator[tuple[Client, Priorities]]:
-        """Whom to tell what."""
+        """Each shard's client, and the priorities of its transitions."""
         num_shards = len(self._clients)
         for shard, client in enumerate(self._clients):
             here = priorities.keys % num_shards == shard
@@ -252,7 +285,7 @@ def _names(num_shards: int) -> list[str]:
 
 
 def split_samples(samples: Samples, batch_size: int) -> Iterator[Samples]:
-    """Mini-batches of consecutive samples, views of theirs."""
+    """Mini-batches of consecutive samples, as views."""
     columns: dict[str, Any] = {
         field.name: column
         for field in dataclasses.fields(samples)
@@ -264,7 +297,7 @@ def split_samples(samples: Samples, batch_size: int) -> Iterator[Samples]:
 
 
 def _answered(pending: PendingReply, stop: StopSignal, last_s: float = 0.0) -> bool:
-    """Whether its result is there; False when stopped and it did not come within `last_s` more."""
+    """Wait for the result; return False if it does not come within `last_s` after a stop."""
     while not pending.wait(_RETRY_S):
         if stop.is_set():
             return pending.wait(last_s)
@@ -272,7 +305,7 @@ def _answered(pending: PendingReply, stop: StopSignal, last_s: float = 0.0) -> b
 
 
 class _Patience:
-    """Says in the log, every `warn_s` without an answer, whom is waited for."""
+    """Logs a warning for every `warn_s` without an answer."""
 
     def __init__(self, what: str, warn_s: float) -> None:
         self._what = what
@@ -286,4 +319,4 @@ class _Patience:
         now = time.monotonic()
         if now - self._warned >= self._warn_s:
             self._warned = now
-            _LOG.warning("%s for %.0f s; still waiting for it", self._what, now - self.since)
+            _LOG.warning("%s for %.0f s; still waiting", self._what, now - self.since)

@@ -1,45 +1,50 @@
-"""Which actor holds which slot of exploration: leases, given by replay, which is always there.
+"""Leases of exploration slots to actors, granted by replay, which every run has.
 
-Invariants: pure, the clock is the caller's; a slot has one holder at a time, and nobody gets it
-before the lease of the one before is over; a holder is one start of an actor, (name, incarnation),
-so that one started again is another. For as long as leases of a table before this one may last, a
-slot is given only to who says that it holds it.
+Invariants: the table is pure, with the caller's clock; a slot has one holder at a time, and is
+free only after its last lease has ended; a holder is one start of an actor, (name, incarnation), so
+a restarted actor is a new holder. While leases of an earlier table may still run, a slot is granted
+only to an actor that claims to hold it.
 """
 
 import bisect
+import time
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 
+from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseReply, LeaseRequest
+from mrcdrl.common.messages.wire import decode, encode
+from mrcdrl.common.transport import Server
 
-MAX_SLOTS = 4096  # where the configuration sets no number
+MAX_SLOTS = 4096  # if the configuration sets no number
+_ANSWERS = 1000  # in one call at most
 Holder = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """Of one slot."""
+    """A slot's holder, and when its lease ends."""
 
     holder: Holder
     until_s: float
 
 
 class LeaseTable:
-    """The slots of a run.
+    """The exploration slots of a run.
 
-    lease_s: how long a lease lasts. num_places: of the ladder; 0: as many as slots are leased.
-    now: of the clock that `answer` is given, in seconds.
+    lease_s: how long a lease lasts. num_places: ranks of the epsilon schedule; 0: as many as slots
+    are leased. now: seconds on the clock that `answer` is given.
     """
 
     def __init__(self, lease_s: float, num_places: int, now: float) -> None:
         self._lease_s = lease_s
         self._num_places = num_places
-        self._open_s = now + lease_s  # from then on slots are given to who holds none
+        self._open_s = now + lease_s  # until then, slots go only to actors that claim them
         self._leases: dict[int, Lease] = {}
-        self._slots: list[int] = []  # that are leased, in order
+        self._slots: list[int] = []  # leased ones, in order
         self._slot_of: dict[Holder, int] = {}
-        self._names: dict[int, str] = {}  # of who had a slot last
-        self._next_end_s = now  # no lease ends before
+        self._names: dict[int, str] = {}  # each slot's last actor
+        self._next_end_s = now  # no lease ends earlier
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -48,7 +53,7 @@ class LeaseTable:
         return f"LeaseTable({', '.join(f'{s}: {self._leases[s].holder}' for s in self._slots)})"
 
     def answer(self, request: LeaseRequest, now: float) -> LeaseReply:
-        """Give a slot, prolong its lease, or take it back."""
+        """Grant a slot, renew its lease, or end it."""
         self._end_leases(now)
         holder = (request.actor, request.incarnation)
         slot = self._slot_of.get(holder)
@@ -64,20 +69,20 @@ class LeaseTable:
         return self._reply(slot)
 
     def check_invariants(self) -> None:
-        """Raises AssertionError where the parts of the table contradict each other."""
+        """Raise AssertionError if the parts of the table contradict each other."""
         if self._slots != sorted(self._leases):
-            raise AssertionError(f"leased are {sorted(self._leases)}, not {self._slots}")
+            raise AssertionError(f"slots {sorted(self._leases)} are leased, not {self._slots}")
         if self._slot_of != {lease.holder: slot for slot, lease in self._leases.items()}:
             raise AssertionError("a holder has two slots, or a slot two holders")
         if any(not 0 <= slot < self._limit for slot in self._slots):
-            raise AssertionError(f"a slot is none of {self._limit}")
+            raise AssertionError(f"a slot is outside 0 ... {self._limit - 1}")
 
     @property
     def _limit(self) -> int:
         return self._num_places or MAX_SLOTS
 
     def _choose(self, request: LeaseRequest, now: float) -> int | None:
-        """A free slot: the one it had, the one that an earlier start of it had, or the lowest."""
+        """A free slot: the actor's last one, an earlier start's, or the lowest."""
         if now < self._open_s and not request.holds:
             return None
         if self._is_free(request.slot):
@@ -111,8 +116,19 @@ class LeaseTable:
         self._next_end_s = min(ends, default=now)
 
     def _reply(self, slot: int) -> LeaseReply:
-        """The place of a slot: the slot itself, or how many below it are leased."""
+        """A slot's exploration rank: the slot itself, or the number of leased slots below it."""
         if self._num_places:
             return LeaseReply(slot, slot, self._num_places, self._lease_s)
         rank = bisect.bisect_left(self._slots, slot)
         return LeaseReply(slot, rank, len(self._slots), self._lease_s)
+
+
+def answer_leases(server: Server, table: LeaseTable) -> None:
+    """Answer the lease requests that are waiting, a limited number per call."""
+    for request in islice(iter(lambda: server.take(0.0), None), _ANSWERS):
+        try:
+            wanted = decode(LeaseRequest, request.payload)
+        except WireError as error:
+            request.refuse(str(error))
+            continue
+        request.reply(encode(table.answer(wanted, time.monotonic())))

@@ -1,24 +1,26 @@
-"""The rate limiter: counters and limits only (Reverb's), so that the table's owner may ask it.
+"""The rate limiter: only counters and limits, as in Reverb, so that the table's owner may ask it.
 
 Invariant: once `min_size` is reached, samples stay within `error_buffer` of
-`samples_per_insert` x (inserts - min_size) whenever both sides ask before they act.
+`samples_per_insert` x (inserts - min_size) if both sides ask before they act.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Self
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.errors import ConfigError
 
 
 @dataclass(slots=True)
 class RateLimiter:
-    """Holds inserts and samples to a ratio.
+    """Keeps samples and inserts at a ratio.
 
-    samples_per_insert: transitions sampled for each inserted; 0: no limit. min_size: inserts
+    samples_per_insert: transitions sampled per inserted one; 0: no limit. min_size: inserts
     before the first sample. error_buffer: samples by which either side may run ahead.
     largest_insert, largest_sample: transitions of one request, for the deadlock check.
 
-    Raises ConfigError when the settings would deadlock.
+    Raises ConfigError for settings that would deadlock.
     """
 
     samples_per_insert: float
@@ -35,9 +37,20 @@ class RateLimiter:
         needed = max(self.samples_per_insert * self.largest_insert, self.largest_sample)
         if self.samples_per_insert and self.error_buffer < needed:
             raise ConfigError(
-                f"replay.tolerance allows {self.error_buffer:.0f} samples of lead, one request "
-                f"moves {needed:.0f}: actors and learner would wait for each other for ever"
+                f"replay.tolerance allows a lead of {self.error_buffer:.0f} samples, one request "
+                f"moves {needed:.0f}: actors and learner would wait for each other forever"
             )
+
+    @classmethod
+    def from_config(cls, config: Config) -> Self:
+        """The limiter of one shard; in lockstep the turns set the pace, and only min_size holds."""
+        return cls.with_tolerance(
+            0.0 if config.run.turn_size else config.replay.samples_per_insert,
+            config.replay.shard_min_size,
+            config.replay.tolerance,
+            largest_insert=config.actor.chunk_length,
+            largest_sample=config.learner.sample_size,
+        )
 
     @classmethod
     def with_tolerance(
@@ -47,15 +60,15 @@ class RateLimiter:
         tolerance: float,
         largest_insert: int,
         largest_sample: int,
-    ) -> "RateLimiter":
-        """With an error buffer of `tolerance` x min_size x ratio, at least two requests' worth."""
+    ) -> Self:
+        """A limiter whose buffer is `tolerance` x min_size x ratio, but at least two requests."""
         one_request = max(samples_per_insert * largest_insert, largest_sample)
         buffer = max(tolerance * min_size * samples_per_insert, 2.0 * one_request)
         return cls(samples_per_insert, min_size, buffer, largest_insert, largest_sample)
 
     @property
     def _lead(self) -> float:
-        """Samples still due for what was inserted; negative: the learner is ahead."""
+        """Samples still due for what was inserted; negative when the learner is ahead."""
         return (self.inserts - self.min_size) * self.samples_per_insert - self.samples
 
     def can_insert(self, count: int) -> bool:
@@ -69,18 +82,18 @@ class RateLimiter:
         return not self.samples_per_insert or self._lead - count >= -self.error_buffer
 
     def resume(self, size: int) -> None:
-        """Go on with a table that holds `size` transitions of earlier processes.
+        """Continue with a table that holds `size` transitions of earlier processes.
 
-        They count as just inserted and neither side as ahead.
+        They count as just inserted, and neither side as ahead.
         """
         self.inserts = size
         self.samples = round(max(size - self.min_size, 0) * self.samples_per_insert)
 
     def restore(self, inserts: int, samples: int) -> None:
-        """Go on with an earlier process's counters, its table whole and at least `min_size`.
+        """Continue an earlier process's counters, given a whole table of at least `min_size`.
 
-        Where samples given since they were noted, or other settings, have led beyond the error
-        buffer, they are brought back to its edge.
+        Samples lost since the counters were saved, or changed settings, may have put the lead
+        outside the error buffer; it is then moved back to the edge.
         """
         self.inserts, self.samples = inserts, samples
         if self.samples_per_insert:

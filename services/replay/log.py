@@ -1,11 +1,11 @@
-"""The segment log: accepted chunks, appended before they are acknowledged, read back at a start.
+"""The segment log: accepted chunks, appended before they are acknowledged, read back at startup.
 
     <directory>/<first key, 15 digits>.segment
     record: length uint32, CRC-32 of the payload uint32 (little-endian), payload (a wire Chunk)
 
-Invariants: a record is whole on the disk's cache when `append` returns, so an acknowledged chunk
-survives kill -9 (with fsync also a power cut); a segment is deleted only when the table has
-evicted all of it; a torn tail is cut off, a corrupt record skipped, and both are reported.
+Invariants: a record is whole in the page cache when `append` returns, so an acknowledged chunk
+survives kill -9, and with fsync a power cut too; a segment is deleted only after the table has
+evicted all of it; a torn tail is cut off, a corrupt record skipped, and both are logged.
 """
 
 import logging
@@ -19,6 +19,7 @@ from pathlib import Path
 
 from zlib_ng import zlib_ng  # ten times as fast as zlib
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.framing import Part
 from mrcdrl.common.runtime.files import reason, sync_directory
@@ -26,12 +27,12 @@ from mrcdrl.common.runtime.files import reason, sync_directory
 _LOG = logging.getLogger("replay")
 _HEADER = struct.Struct("<II")
 _SUFFIX = ".segment"
-_PARTS = 1024  # of one call, at most
+_PARTS = 1024  # in one call of writev at most
 
 
 @dataclass(slots=True)
 class _Segment:
-    """A file, and the table's keys of the transitions in it."""
+    """A file, and the table's keys for the transitions in it."""
 
     path: Path
     first_key: int
@@ -44,10 +45,10 @@ def segment_paths(directory: Path) -> list[Path]:
 
 
 def read_segment(path: Path) -> Iterator[tuple[int, int, bytes | None]]:
-    """Of each record where it begins, where it ends, and its payload, None where that is corrupt.
+    """Yield each record's begin, end and payload; the payload is None if it is corrupt.
 
-    Ends at the first record that is not whole: what is left of the file is a torn tail, bytes
-    of a write that never ended or, after a power cut, of one that never began.
+    Ends at the first incomplete record. The rest of the file is a torn tail: bytes of a write
+    that never finished or, after a power cut, never began.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -65,7 +66,7 @@ def read_segment(path: Path) -> Iterator[tuple[int, int, bytes | None]]:
 class SegmentLog:
     """Appends payloads to segments of about `segment_bytes`.
 
-    Raises RunDirectoryError where the directory cannot be written.
+    Raises RunDirectoryError when the directory cannot be made.
     """
 
     def __init__(self, directory: Path, *, segment_bytes: int, fsync: bool) -> None:
@@ -82,20 +83,20 @@ class SegmentLog:
             _Segment(path, int(path.stem), int(path.stem)) for path in segment_paths(directory)
         )
         self.corrupt = 0
-        """Records skipped because their bytes were not what was written."""
+        """Records skipped because their checksum did not match."""
 
     @property
     def directory(self) -> Path:
-        """Where the segments lie."""
+        """The directory of the segments."""
         return self._directory
 
     @property
     def first_key(self) -> int:
-        """Key of the oldest transition kept; 0 in an empty log."""
+        """Key of the oldest transition in the log; 0 if it is empty."""
         return self._segments[0].first_key if self._segments else 0
 
     def recover(self, next_key: Callable[[], int]) -> Iterator[bytes]:
-        """All whole payloads, oldest first; to be exhausted before the first append.
+        """Yield all whole payloads, oldest first; exhaust it before the first append.
 
         next_key: key of the transition after those recovered so far.
         """
@@ -105,22 +106,22 @@ class SegmentLog:
             for offset, end, payload in read_segment(segment.path):
                 if payload is None:
                     self.corrupt += 1
-                    _LOG.warning("%s: record at byte %d is corrupt, skipped", segment.path, offset)
+                    _LOG.warning("%s: skipped a corrupt record at byte %d", segment.path, offset)
                 else:
                     yield payload
                 self._size = end
             lost = segment.path.stat().st_size - self._size
             if lost:
-                _LOG.warning("%s: torn tail of %d bytes cut off", segment.path, lost)
+                _LOG.warning("%s: cut off a torn tail of %d bytes", segment.path, lost)
                 os.truncate(segment.path, self._size)
             segment.next_key = next_key()
         if self._segments:
             self._open(self._segments[-1], self._size)
 
     def append(self, payloads: Sequence[Part], first_key: int, num_transitions: int) -> None:
-        """Write a record each; raises OSError, and then none of them is in the log.
+        """Write one record per payload; raises OSError, after which none of them is in the log.
 
-        first_key, num_transitions: of all of them.
+        first_key, num_transitions: of all payloads together.
         """
         if self._descriptor is None or self._size >= self._segment_bytes:
             self._rotate(first_key)
@@ -136,12 +137,12 @@ class SegmentLog:
         self._segments[-1].next_key = first_key + num_transitions
 
     def forget(self, first_key: int) -> None:
-        """Delete segments whose transitions are all older than `first_key`."""
+        """Delete segments all of whose transitions are older than `first_key`."""
         while len(self._segments) > 1 and self._segments[0].next_key <= first_key:
             self._segments.popleft().path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Bring the last segment to the disk; those before it the system has, in its own time."""
+        """Sync the last segment to disk; the system writes out earlier ones in its own time."""
         self._end_segment(fsync=True)
 
     def _end_segment(self, *, fsync: bool) -> None:
@@ -162,7 +163,9 @@ class SegmentLog:
     @staticmethod
     def _write_some(descriptor: int, parts: Sequence[Part]) -> None:
         written = os.writev(descriptor, parts)
-        if written < sum(map(len, parts)):  # no space for all of it: the next write says why
+        if written < sum(
+            map(len, parts)
+        ):  # no space for all of it: the next write raises the reason
             remaining = memoryview(b"".join(parts))[written:]
             while remaining:
                 remaining = remaining[os.write(descriptor, remaining) :]
@@ -180,3 +183,14 @@ class SegmentLog:
     def _open(self, segment: _Segment, size: int) -> None:
         self._descriptor = os.open(segment.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         self._size = size
+
+
+def open_log(config: Config, directory: Path) -> SegmentLog | None:
+    """The log a configuration asks for."""
+    if config.replay.fsync == "off":
+        return None
+    return SegmentLog(
+        directory,
+        segment_bytes=config.replay.segment_bytes,
+        fsync=config.replay.fsync == "always",
+    )

@@ -1,6 +1,6 @@
-"""Which chunks arrived already: (actor, incarnation, sequence) makes a repeated insert harmless.
+"""Recognize repeated inserts by (actor, incarnation, sequence), so that they do no harm.
 
-Invariant: memory is bounded by `max_streams`; the streams heard of least recently go first.
+Invariant: memory is bounded by `max_streams`; the streams heard from least recently go first.
 """
 
 from collections import OrderedDict
@@ -8,7 +8,7 @@ from enum import Enum, auto
 
 
 class Arrival(Enum):
-    """What a sequence number says of its chunk."""
+    """What a sequence number says about its chunk."""
 
     NEXT = auto()
     REPEATED = auto()
@@ -16,21 +16,21 @@ class Arrival(Enum):
 
 
 class SequenceBook:
-    """The last sequence number of every (actor, incarnation)."""
+    """Keeps the last sequence number of every (actor, incarnation)."""
 
     def __init__(self, max_streams: int = 4096) -> None:
         self._last: OrderedDict[tuple[str, int], int] = OrderedDict()
         self._max_streams = max_streams
 
     def classify(self, actor: str, incarnation: int, sequence: int) -> Arrival:
-        """Whether the chunk is the next one, was here before, or skips some."""
+        """Tell whether the chunk is the next one, came before, or skips some."""
         last = self._last.get((actor, incarnation), -1)
         if sequence <= last:
             return Arrival.REPEATED
         return Arrival.NEXT if sequence == last + 1 else Arrival.GAP
 
     def record(self, actor: str, incarnation: int, sequence: int) -> int | None:
-        """Remember that the chunk is stored; the sequence number that was the last before."""
+        """Remember that the chunk is stored; return its stream's last sequence number before."""
         before = self._last.get((actor, incarnation))
         self._last[actor, incarnation] = sequence
         self._last.move_to_end((actor, incarnation))
@@ -39,7 +39,7 @@ class SequenceBook:
         return before
 
     def take_back(self, actor: str, incarnation: int, before: int | None) -> None:
-        """The chunk recorded last of the stream is not stored after all; `before`: of `record`."""
+        """Undo the stream's last `record`, which returned `before`: the chunk is not stored."""
         if before is None:
             self._last.pop((actor, incarnation), None)
         else:

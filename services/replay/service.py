@@ -1,8 +1,8 @@
 """The shell around the table: threads that insert, sample and set priorities, under one lock.
 
-Invariants: a chunk is acknowledged only after it is in the log and the table; a request is
-answered within `hold_s`: by the data, a refusal with its reason, or "held", which asks the peer
-to try again.
+Invariants: a chunk is acknowledged only after it is in the log and the table; every request is
+answered within `hold_s`: with the data, refused with the reason, or throttled, which tells the
+peer to ask again.
 """
 
 import logging
@@ -12,11 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.framing import Part, split_set
+from mrcdrl.common.messages.metrics import ReplayMetrics
 from mrcdrl.common.messages.trajectory import (
     Chunk,
     InsertReply,
@@ -26,7 +25,7 @@ from mrcdrl.common.messages.trajectory import (
 )
 from mrcdrl.common.messages.wire import decode, encode, encode_parts
 from mrcdrl.common.runtime.files import reason
-from mrcdrl.common.sync.lockstep import Lockstep
+from mrcdrl.services.replay.admission import make_admission
 from mrcdrl.services.replay.limiter import RateLimiter
 from mrcdrl.services.replay.log import SegmentLog
 from mrcdrl.services.replay.sequence import Arrival, SequenceBook
@@ -34,8 +33,8 @@ from mrcdrl.services.replay.snapshot import Snapshot, SnapshotWriter, read_snaps
 from mrcdrl.services.replay.table import Table
 
 _LOG = logging.getLogger("replay")
-_TAKE_S = 0.2  # how soon a thread sees that it is to stop
-_GROUP = 16  # requests to insert that may share one hold of the lock
+_TAKE_S = 0.2  # how soon a thread notices a stop
+_GROUP = 16  # insert requests stored under one lock at most
 _COUNTS = (
     *("chunks", "duplicates", "gaps", "refused", "log_errors"),
     *("priority_updates", "priorities_ignored"),
@@ -43,7 +42,7 @@ _COUNTS = (
 
 
 class _Request(Protocol):
-    """What the service needs of a transport's request."""
+    """What the service needs from a transport's request."""
 
     @property
     def payload(self) -> Part: ...
@@ -58,16 +57,16 @@ class _Request(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Accepted:
-    """A chunk that is to be logged and stored."""
+    """A chunk to log and store."""
 
     message: Part
     chunk: Chunk
     arrival: Arrival
-    before: int | None  # the sequence number of its stream's last
+    before: int | None  # last sequence number of its stream, before this one
 
 
 class _Server(Protocol):
-    refused: int  # that were too large to be taken
+    refused: int  # requests too large to take
 
     def take(self, timeout_s: float) -> _Request | None: ...
 
@@ -85,7 +84,7 @@ class ReplayService:
         priorities: _Server,
         log: SegmentLog | None = None,
     ) -> None:
-        """log: what outlives the process, with a snapshot beside it; None: nothing does."""
+        """log: keeps chunks beyond the process, beside a snapshot; None: nothing is kept."""
         self._config = config
         self._table = table
         self._limiter = limiter
@@ -94,16 +93,16 @@ class ReplayService:
         self._snapshots = (
             None if log is None else SnapshotWriter(log.directory, self.snapshot, period_s)
         )
-        self._lockstep = Lockstep.from_config(config)
+        self._admission = make_admission(config, table, limiter)
         self._book = SequenceBook()
         self._accepted: list[_Accepted] = []  # neither logged nor stored yet
-        self._owed: list[tuple[_Request, InsertReply]] = []  # once all of them are
-        self._earlier = {"inserts": 0, "samples": 0}  # that the limiter does not count
+        self._owed: list[tuple[_Request, InsertReply]] = []  # replies due once they are stored
+        self._earlier = {"inserts": 0, "samples": 0}  # not counted by the limiter
         self._changed = threading.Condition()
         self._log_fails = False
         self._stopping = threading.Event()
         self._counts = dict.fromkeys(_COUNTS, 0)
-        self._held = {"insert_held": False, "sample_held": False}
+        self._throttled = {"insert_held": False, "sample_held": False}
         self._servers = (inserts, samples, priorities)
         self._threads = [
             threading.Thread(target=self._serve_inserts, args=(inserts,), name="insert"),
@@ -114,7 +113,7 @@ class ReplayService:
         ]
 
     def recover(self) -> None:
-        """Take in what the log and a snapshot kept of earlier processes; before `start`."""
+        """Restore what earlier processes kept in the log and a snapshot; call before `start`."""
         if self._log is None:
             return
         self._table.number_from(self._log.first_key)
@@ -131,7 +130,7 @@ class ReplayService:
                 left_out = str(error)
         if left_out:
             count = self._counts["refused"]
-            _LOG.warning("%d chunks of the log are left out, the last: %s", count, left_out)
+            _LOG.warning("%d chunks in the log were left out; the last: %s", count, left_out)
         self._forget()
         self._limiter.resume(len(self._table))
         evicted = self._table.next_key - len(self._table)
@@ -147,7 +146,7 @@ class ReplayService:
             }
 
     def snapshot(self) -> Snapshot:
-        """What a snapshot's file is to hold now."""
+        """A snapshot of the table as it is now."""
         with self._changed:
             return Snapshot.take(self._config, self._table, self._limiter, self._all_samples)
 
@@ -162,7 +161,7 @@ class ReplayService:
             self._snapshots.start()
 
     def stop(self) -> None:
-        """Answer what is being served, then end all threads."""
+        """Answer the requests being served, then end all threads."""
         self._stopping.set()
         with self._changed:
             self._changed.notify_all()
@@ -173,29 +172,30 @@ class ReplayService:
 
     @property
     def healthy(self) -> bool:
-        """All threads live; one that died of a bug of ours ends the service."""
+        """Whether all threads live; one that died from a bug ends the service."""
         snapshots = self._snapshots is None or self._snapshots.healthy
         return snapshots and all(thread.is_alive() for thread in self._threads)
 
     @property
     def accepting(self) -> bool:
-        """Nothing keeps chunks from being stored; False while the log cannot be written."""
+        """Whether chunks can be stored; False while the log cannot be written."""
         return not self._log_fails
 
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> ReplayMetrics:
         with self._changed:
-            return {
-                "size": len(self._table),
-                "capacity": self._table.capacity,
-                "min_size": self._limiter.min_size,
-                "inserts": self._earlier["inserts"] + self._limiter.inserts,
-                "samples": self._all_samples,
-                "samples_per_insert": self._limiter.ratio,
-                "bytes": self._table.nbytes,
-                **self._counts,
-                "refused": self._counts["refused"] + sum(s.refused for s in self._servers),
-                **self._held,
-            }
+            refused = self._counts["refused"] + sum(s.refused for s in self._servers)
+            counts = self._counts | {"refused": refused}
+            return ReplayMetrics(
+                size=len(self._table),
+                capacity=self._table.capacity,
+                min_size=self._limiter.min_size,
+                inserts=self._earlier["inserts"] + self._limiter.inserts,
+                samples=self._all_samples,
+                samples_per_insert=self._limiter.ratio,
+                bytes=self._table.nbytes,
+                **counts,
+                **self._throttled,
+            )
 
     def _serve(self, server: _Server, answer: Callable[[_Request], None]) -> None:
         while not self._stopping.is_set():
@@ -204,9 +204,9 @@ class ReplayService:
                 self._answer(request, answer)
 
     def _serve_inserts(self, server: _Server) -> None:
-        """What waits already is written and stored together.
+        """Write and store the requests that are already waiting together.
 
-        To write costs a wait for this process's turn in Python, to store one for a whole sample.
+        A write costs one wait for the interpreter lock, storing one wait for a whole sample.
         """
         while not self._stopping.is_set():
             for count in range(_GROUP):
@@ -225,9 +225,9 @@ class ReplayService:
             request.refuse(str(error))
 
     def _insert(self, request: _Request) -> None:
-        """Accept the chunks of a request; `_commit` answers it, unless it is held here.
+        """Accept the chunks of a request; `_commit` answers it unless it is throttled here.
 
-        One thread inserts, so that what it found stays so while it does not hold the lock.
+        Only one thread inserts, so what it found stays true while it does not hold the lock.
         """
         messages = split_set(request.payload)
         chunks = [self._checked(message) for message in messages]
@@ -247,7 +247,7 @@ class ReplayService:
         self._owed.append((request, reply))
 
     def _commit(self) -> str:
-        """Log what is accepted, store it, and answer; else why all of it is held."""
+        """Log and store the accepted chunks, and answer; return why all are throttled, or ""."""
         accepted, owed = self._accepted, self._owed
         self._accepted, self._owed = [], []
         why_not = self._append(accepted)
@@ -268,7 +268,7 @@ class ReplayService:
         return ""
 
     def _append(self, accepted: Sequence[_Accepted]) -> str:
-        """Write to the log, if there is one, while samples go on; else why that cannot be."""
+        """Write to the log, if any, while sampling continues; return why that failed, or ""."""
         if self._log is None or not accepted:
             return ""
         messages = [each.message for each in accepted]
@@ -279,7 +279,7 @@ class ReplayService:
             self._log_fails = True
             self._counts["log_errors"] += 1
             if self._counts["log_errors"] == 1:
-                _LOG.warning("the log cannot be written, inserts wait: %s", reason(error))
+                _LOG.warning("cannot write the log; inserts wait: %s", reason(error))
             return f"replay's log cannot be written: {reason(error)}"
         self._log_fails = False
         return ""
@@ -290,14 +290,14 @@ class ReplayService:
         if len(chunk) > self._limiter.largest_insert:
             raise WireError(
                 f"{len(chunk)} transitions where the run's actor.chunk_length is "
-                f"{self._limiter.largest_insert}: the rate limiter might never let them in"
+                f"{self._limiter.largest_insert}: the rate limiter might never admit them"
             )
         return chunk
 
     def _why_not_admitted(self, request: _Request, chunk: Chunk) -> str:
-        """Why the rate limiter does not let the chunk in for now; empty where it does."""
-        if self._limiter.can_insert(self._num_accepted + len(chunk)):  # samples only allow more
-            self._held["insert_held"] = False
+        """Why the rate limiter does not admit the chunk yet; "" if it does."""
+        if self._limiter.can_insert(self._num_accepted + len(chunk)):  # sampling only allows more
+            self._throttled["insert_held"] = False
             return ""
         why_not = self._commit()
         if why_not:
@@ -309,58 +309,42 @@ class ReplayService:
 
     @property
     def _num_accepted(self) -> int:
-        """Transitions that are not in the table yet."""
+        """Accepted transitions that are not in the table yet."""
         return sum(len(each.chunk) for each in self._accepted)
 
     def _classify(self, chunk: Chunk) -> Arrival:
         return self._book.classify(chunk.actor, chunk.incarnation, chunk.sequence)
 
     def _store(self, chunk: Chunk, arrival: Arrival) -> None:
-        """Put a chunk into the table; count it."""
+        """Insert a chunk into the table and count it."""
         self._table.insert(chunk)
         self._limiter.inserts += len(chunk)
         self._counts["chunks"] += 1
         self._counts["gaps"] += arrival is Arrival.GAP
 
     def _forget(self) -> None:
-        """Drop what the table has evicted; a file that stays is only in the way."""
+        """Delete segments that the table has evicted; one that remains does no harm."""
         if self._log is None:
             return
         try:
             self._log.forget(self._table.first_key)
         except OSError as error:
-            _LOG.warning("an old file of the log stays: %s", reason(error))
+            _LOG.warning("cannot delete an old segment of the log: %s", reason(error))
 
     def _sample(self, request: _Request) -> None:
-        asked = decode(SampleRequest, request.payload)
-        size = asked.batch_size
+        wanted = decode(SampleRequest, request.payload)
+        size = wanted.batch_size
         if not 1 <= size <= self._limiter.largest_sample:
             raise WireError(f"batch_size {size} is outside 1 ... {self._limiter.largest_sample}")
         with self._changed:
-            if not self._wait("sample_held", request, lambda: self._can_sample(asked)):
-                request.throttle(self._why_no_sample())
+            if not self._wait("sample_held", request, lambda: self._admission.can_sample(wanted)):
+                request.throttle(self._admission.why_not(wanted))
                 return
-            if self._lockstep is not None:
-                seeds = (self._config.replay.seed, asked.learner_step)
-                self._table.sampler.rng = np.random.default_rng(seeds)
+            self._admission.reseed(wanted)
             samples = self._table.sample(size, request.room(self._table.sample_bytes(size)))
             self._limiter.samples += size
             self._changed.notify_all()
         request.reply(encode_parts(samples))
-
-    def _can_sample(self, asked: SampleRequest) -> bool:
-        """Raises WireError where it asks for what is not to be had any more, or never was."""
-        if self._lockstep is None:
-            return self._limiter.can_sample(asked.batch_size)
-        if asked.learner_step < 0:
-            raise WireError("a run that takes turns is asked for the samples of a learner step")
-        inserts, due = self._table.next_key, self._lockstep.inserts(asked.learner_step)
-        if inserts > due:
-            raise WireError(
-                f"{inserts} transitions where {due} are due at learner step {asked.learner_step}: "
-                "another actor, or a checkpoint that is older than the last turn?"
-            )
-        return inserts == due
 
     def _prioritize(self, request: _Request) -> None:
         message = decode(Priorities, request.payload)
@@ -372,18 +356,12 @@ class ReplayService:
         request.reply(encode(PrioritiesReply(updated, ignored)))
 
     def _wait(self, flag: str, request: _Request, ready: Callable[[], bool]) -> bool:
-        """Wait, the lock given up meanwhile, until ready; False where that took too long."""
+        """Release the lock and wait until ready; return False if that took too long."""
         if ready():
-            self._held[flag] = False
+            self._throttled[flag] = False
             return True
-        self._held[flag] = True
+        self._throttled[flag] = True
         left = request.arrived_s + self._config.replay.hold_s - time.monotonic()
         self._changed.wait_for(lambda: self._stopping.is_set() or ready(), max(left, 0.0))
-        self._held[flag] = not ready()
+        self._throttled[flag] = not ready()
         return ready() and not self._stopping.is_set()
-
-    def _why_no_sample(self) -> str:
-        limiter = self._limiter
-        if limiter.inserts < limiter.min_size:
-            return f"the table holds {limiter.inserts} of the first {limiter.min_size} transitions"
-        return "the actors have not inserted enough for another sample yet"

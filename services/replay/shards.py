@@ -1,7 +1,7 @@
-"""Requests to one of the shards that share a table, sent ahead and answered in order.
+"""Sample requests to one of the shards of a table, sent ahead and answered in order.
 
-Invariant: a shard that is away or holds back costs its reader no more than one wait: from then on
-it is left out until it has answered.
+Invariant: a shard that is unreachable or throttled costs its reader no more than one wait: from
+then on it is left out until it answers.
 """
 
 import logging
@@ -19,25 +19,25 @@ from mrcdrl.common.transport import Client, PendingReply
 
 _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2
-_SAME = 0.05  # of the probability with which a shard is drawn, the part that is the same for all
+_UNIFORM = 0.05  # part of a shard's probability that is the same for all shards
 
 
 def shard_of(actor: str, num_shards: int) -> int:
-    """Where an actor's chunks go: by the number its name ends with, else by its name's checksum."""
+    """The shard of an actor's chunks: by its name's trailing number, else by its checksum."""
     digits = actor[len(actor.rstrip("0123456789")) :]
     return (int(digits) if digits else zlib.crc32(actor.encode())) % num_shards
 
 
-def shares(total_priorities: Sequence[float | None]) -> Float64Array:
-    """With which probability each shard is drawn, [S]; None: not heard of yet.
+def shard_probabilities(total_priorities: Sequence[float | None]) -> Float64Array:
+    """The probability of sampling from each shard, [S]; None: its total is not known yet.
 
-    In proportion to the totals, but for a small part that is the same for all: a total is heard
-    of with the shard's samples only, and one that has risen must be drawn to be known.
+    Proportional to the totals, but for a small part that is the same for all: a total arrives
+    only with the shard's samples, so one that has risen stays unknown until it is sampled.
     """
     known = [total for total in total_priorities if total is not None]
     typical = sum(known) / len(known) if known else 1.0
     totals = np.array([typical if total is None else total for total in total_priorities])
-    result: Float64Array = _SAME / len(totals) + (1 - _SAME) * totals / totals.sum()
+    result: Float64Array = _UNIFORM / len(totals) + (1 - _UNIFORM) * totals / totals.sum()
     return result
 
 
@@ -52,18 +52,18 @@ class ShardStream:
         self._request = request
         self._in_flight = requests_in_flight
         self._pending: deque[PendingReply] = deque()
-        self._given: PendingReply | None = None  # whose samples are being read
+        self._taken: PendingReply | None = None  # holds the samples being read
         self._reply_bytes = 0
         self._ask_at_s = 0.0
-        self._away = False
+        self._reachable = True
         self.late = False
-        """It was waited for in vain."""
+        """The last wait for it was in vain."""
         self.total_priority: float | None = None
-        """As last heard of."""
+        """As of its last answer."""
         self.table_size = 0
 
     def ready(self, timeout_s: float = 0.0) -> bool:
-        """Whether an answer is there to be taken; asks ahead, and waits up to `timeout_s`."""
+        """Whether `take` has an answer; sends requests ahead, and waits up to `timeout_s`."""
         if time.monotonic() >= self._ask_at_s:
             while len(self._pending) < self._in_flight:
                 asked = self._client.ask(self._request(), reply_bytes=self._reply_bytes)
@@ -76,8 +76,8 @@ class ShardStream:
     def take(self) -> Samples:
         """The answer that is ready; its arrays are valid until the next call, or `release`.
 
-        Raises ThrottledError where the shard holds back, DeadlineError where it is away,
-        RefusedError with its reason.
+        Raises ThrottledError if the shard throttled it, DeadlineError if the shard is unreachable,
+        RefusedError with the shard's reason.
         """
         self.release()
         pending = self._pending.popleft()
@@ -90,20 +90,20 @@ class ShardStream:
         except DeadlineError:
             self.late = True
             self._ask_at_s = time.monotonic() + _RETRY_S
-            self._say(away=True)
+            self._note(reachable=False)
             raise
-        self._given, self._reply_bytes = pending, len(payload)
+        self._taken, self._reply_bytes = pending, len(payload)
         self.total_priority, self.table_size = samples.total_priority, samples.table_size
-        self._say(away=False)
+        self._note(reachable=True)
         return samples
 
     def release(self) -> None:
-        """What was taken is no longer read."""
-        if self._given is not None:
-            self._given.release()
-            self._given = None
+        """Give back the memory of what was taken; it is no longer read."""
+        if self._taken is not None:
+            self._taken.release()
+            self._taken = None
 
-    def _say(self, *, away: bool) -> None:
-        if away is not self._away:
-            self._away = away
-            _LOG.info("%s %s", self._whom, "does not answer" if away else "answers again")
+    def _note(self, *, reachable: bool) -> None:
+        if reachable is not self._reachable:
+            self._reachable = reachable
+            _LOG.info("%s %s", self._whom, "answers again" if reachable else "does not answer")

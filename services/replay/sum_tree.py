@@ -1,11 +1,11 @@
-"""Non-negative numbers with their sum, drawn in proportion to what they are (Schaul et al. 2016).
+"""Non-negative values with their sum, sampled in proportion to their size (Schaul et al. 2016).
 
-Binary trees side by side: to add up and search a few thousand numbers that lie next to each other
-takes numpy less time than the levels it spares.
+The tree is cut into many trees side by side: numpy sums and searches a few thousand adjacent roots
+faster than it walks the levels that this saves.
 
-Invariants (`check_invariants`): a node is the sum of its two children as computed last, never
-changed by a difference, so errors of rounding do not add up; an index whose value is 0 is never
-drawn. Pure numpy: each call works on all its indices at once, level by level.
+Invariants (`check_invariants`): a node is the sum of its two children as last computed, never
+updated by a difference, so rounding errors do not accumulate; an index with value 0 is never
+sampled. Pure numpy: each call works on all its indices at once, level by level.
 """
 
 import numpy as np
@@ -13,13 +13,13 @@ import numpy as np
 from mrcdrl.common.messages.trajectory import Float64Array, Int64Array
 
 NODE_BYTES = 8
-MAX_NODES = 4  # for each value
+MAX_NODES = 4  # per value
 
 
 class SumTree:
     """`size` values, 0 at first, as the leaves of binary trees of float64 sums.
 
-    num_roots: how many trees at most, a power of two.
+    num_roots: the most trees, a power of two.
     """
 
     def __init__(self, size: int, num_roots: int = 4096) -> None:
@@ -28,7 +28,7 @@ class SumTree:
         self._size = size
         levels = (size - 1).bit_length()
         self._first_leaf = 1 << levels
-        self._first_root = min(num_roots, self._first_leaf)  # as many as come before it
+        self._first_root = min(num_roots, self._first_leaf)  # as many roots as nodes before them
         self._depth = levels - (self._first_root.bit_length() - 1)
         # Node i has the children 2i and 2i + 1; those before the first root are unused.
         self._nodes: Float64Array = np.zeros(2 * self._first_leaf, np.float64)
@@ -52,9 +52,9 @@ class SumTree:
         return self._nodes[indices + self._first_leaf]
 
     def set(self, indices: Int64Array, values: Float64Array) -> None:
-        """Put values, float64 [len(indices)], at indices; of one given twice the last counts.
+        """Put values, float64 [len(indices)], at indices; the last one wins if an index repeats.
 
-        Raises ValueError for a value that is negative or not finite, or an index that is none.
+        Raises ValueError for a value that is negative or not finite, or an index out of range.
         """
         self._check(indices)
         _check_values(values)
@@ -67,7 +67,7 @@ class SumTree:
     def fill(self, start: int, values: Float64Array) -> None:
         """Put values, float64 [N], at the indices start ... start + N - 1.
 
-        Several times faster than `set`: of each level the nodes above them lie side by side.
+        Several times faster than `set`, because their parents are adjacent on every level.
         Raises ValueError as `set` does.
         """
         if len(values) == 0:
@@ -89,15 +89,15 @@ class SumTree:
                 nodes[first : last + 1] = lefts + rights
 
     def sample(self, uniforms: Float64Array) -> Int64Array:
-        """As many indices as there are uniform numbers in 0 ... 1 (1 excluded), stratified.
+        """One index per uniform number in 0 ... 1 (1 excluded), stratified.
 
-        The total is cut into as many equal parts, and one index drawn of each, so that index i is
-        expected len(uniforms) x value / total times. Raises ValueError when all values are 0.
+        The total is cut into len(uniforms) equal strata, and each gives one index, so that index i
+        is expected len(uniforms) x value / total times. Raises ValueError when all values are 0.
         """
         ends = self._roots.cumsum()
         total = ends[-1]
         if total == 0:
-            raise ValueError("nothing to draw: all values are 0")
+            raise ValueError("nothing to sample: all values are 0")
         count = len(uniforms)
         targets = _below((np.arange(count) + uniforms) / count * total, total)
         trees = ends.searchsorted(targets, side="right")
@@ -132,7 +132,7 @@ def _check_values(values: Float64Array) -> None:
 
 
 def _below(targets: Float64Array, sums: Float64Array | np.float64) -> Float64Array:
-    """Targets held below the sums they fall into; rounding may have put them on the edge.
+    """Clip targets below the sums they fall into; rounding may have put them on the edge.
 
     A target below a sum leads to a child with a sum above 0, and so on down to a leaf above 0.
     """

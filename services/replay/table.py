@@ -1,22 +1,22 @@
 """The table: a ring of observation records in stream order, and the transitions over them.
 
 Invariants (`check_invariants`): transition keys are consecutive, the newest `size` of all ever
-inserted; chunks leave whole. The records past a chunk's last transition, its tail, lie apart until
-the chunk comes that goes on with them, of the same robot; then its rows serve for both, as it
-outlives the one before. Pure: no clock, lock or transport.
+inserted; chunks are evicted whole. The records past a chunk's last transition, its tail, are set
+apart until the same robot's next chunk arrives, which begins with them; its rows then serve both
+chunks, as it outlives the earlier one. Pure: no clock, lock or transport.
 """
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.errors import ConfigError, WireError
 from mrcdrl.common.messages.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
-from mrcdrl.services.replay.sampler import Sampler
-
-_COLUMNS_BYTES = 4 + 1 + 4 + 1 + 4 + 4 + 1 + 8  # of one transition
-_TAILS = 0.8  # kept at once for each full chunk: episodes have some 1.25 chunks, or more
+from mrcdrl.services.replay.capacity import TAILS_PER_CHUNK, capacity_of
+from mrcdrl.services.replay.sampler import Sampler, make_sampler
 
 
 @dataclass(slots=True)
@@ -26,24 +26,19 @@ class _Extent:
     first_key: int
     num_transitions: int
     first_row: int
-    num_rows: int  # of the ring; a tail among them stays there
+    num_rows: int  # in the ring; a tail among them stays there
     tail_hash: int
-    tail_row: int | None  # of a tail that lies apart
-
-
-def bytes_per_transition(window: int, chunk_length: int, record_bytes: int) -> float:
-    """Memory of records and columns, by the transition; the sampler's comes on top."""
-    return record_bytes * (1 + _TAILS * (window - 1) / chunk_length) + _COLUMNS_BYTES
+    tail_row: int | None  # first row of a tail that is set apart
 
 
 class Table:
-    """First in, first out; a sampler says which transitions are drawn.
+    """Keeps transitions first in, first out; a sampler chooses those of a mini-batch.
 
-    capacity: transitions. stack: records of a state. n_step: longest return; a transition
-    touches a window of stack + n_step records. chunk_length: transitions of most chunks; many
-    that are shorter, or that no other goes on with, leave less than the capacity. record_bytes:
-    length of one record. sampler: of the same capacity, for this table alone. All memory is taken,
-    and touched, at once.
+    capacity: transitions. stack: records in a state. n_step: longest return; a transition's
+    window is stack + n_step records. chunk_length: transitions in most chunks; with many chunks
+    that are shorter, or that no later chunk continues, the table holds less than its capacity.
+    record_bytes: length of one record. sampler: of the same capacity, for this table alone. All
+    memory is allocated, and touched, at once.
     """
 
     def __init__(
@@ -58,7 +53,7 @@ class Table:
         window = stack + n_step
         overlap = window - 1
         num_ring_rows = capacity + chunk_length + overlap
-        num_rows = num_ring_rows + overlap * (int(_TAILS * capacity / chunk_length) + 1)
+        num_rows = num_ring_rows + overlap * (int(TAILS_PER_CHUNK * capacity / chunk_length) + 1)
         if num_rows > np.iinfo(np.int32).max:
             raise ConfigError(f"replay.capacity {capacity} needs {num_rows} rows; lower it")
         try:
@@ -66,7 +61,7 @@ class Table:
         except MemoryError as error:
             raise ConfigError(
                 f"replay.capacity {capacity} needs {num_rows * record_bytes >> 20} MiB for its "
-                "records, more than this machine gives; lower it"
+                "records, more than this machine has; lower it"
             ) from error
         self._capacity = capacity
         self._window = window
@@ -74,7 +69,7 @@ class Table:
         self._in_window = np.arange(window)
         self._num_ring_rows = num_ring_rows
         self._start_rows = np.zeros(capacity, np.int32)
-        self._num_own = np.zeros(capacity, np.uint8)  # rows of the window from its start
+        self._num_own = np.zeros(capacity, np.uint8)  # rows of the window that follow its start
         self._rest_rows = np.zeros(capacity, np.int32)  # where the window's other rows begin
         self._actions = np.zeros(capacity, np.uint8)
         self._rewards = np.zeros(capacity, np.float32)
@@ -83,42 +78,60 @@ class Table:
         self._weights_versions = np.zeros(capacity, np.int64)
         self._extents: deque[_Extent] = deque()
         self._free_tails = list(range(num_ring_rows, num_rows, overlap))
-        self._waiting: dict[int, _Extent] = {}  # by the hash of their tail, which lies apart
+        self._waiting: dict[int, _Extent] = {}  # by the hash of their tail, which is set apart
         self._next_key = 0
         self._next_row = 0
         self._sampler = sampler
+
+    @classmethod
+    def from_config(cls, config: Config, *, record_bytes: int | None = None) -> Self:
+        """The table of one shard.
+
+        record_bytes: kept of each record; None: all of them. Raises ConfigError where
+        replay.capacity_bytes leaves no room for replay.min_size.
+        """
+        capacity = capacity_of(config)
+        return cls(
+            capacity=capacity,
+            stack=config.arena.stack,
+            n_step=config.agent.n_step,
+            # In lockstep the capacity alone decides what is evicted, not where chunks lie.
+            chunk_length=1 if config.run.turn_size else config.actor.chunk_length,
+            record_bytes=config.arena.record_bytes if record_bytes is None else record_bytes,
+            sampler=make_sampler(config.replay, capacity),
+        )
 
     def __len__(self) -> int:
         return self._next_key - self.first_key
 
     @property
     def first_key(self) -> int:
-        """Key of the oldest transition; of the next one in an empty table."""
+        """Key of the oldest transition; in an empty table, of the next one."""
         return self._extents[0].first_key if self._extents else self._next_key
 
     @property
     def next_key(self) -> int:
-        """Key of the next transition; transitions ever inserted."""
+        """Key of the next transition; the number of transitions ever inserted."""
         return self._next_key
 
     def number_from(self, key: int) -> None:
         """Give the next transition this key; ValueError unless the table is empty."""
         if len(self):
-            raise ValueError("only an empty table can be numbered anew")
+            raise ValueError("only an empty table can be renumbered")
         self._next_key = key
 
     @property
     def keys(self) -> range:
-        """Of the transitions there are now."""
+        """Keys of the transitions in the table."""
         return range(self.first_key, self._next_key)
 
     @property
     def sampler(self) -> Sampler:
-        """Which says what is drawn."""
+        """The sampler of this table's transitions."""
         return self._sampler
 
     def rewards(self, keys: range) -> Float32Array:
-        """A copy of these transitions' n-step returns [len(keys)]."""
+        """A copy of the n-step returns [len(keys)] of transitions in the table."""
         return self._rewards[np.arange(keys.start, keys.stop) % self._capacity]
 
     @property
@@ -127,7 +140,7 @@ class Table:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the records and of what is kept a transition."""
+        """Memory of the records, the columns and the sampler."""
         columns = (
             self._rows,
             self._start_rows,
@@ -142,7 +155,7 @@ class Table:
         return sum(column.nbytes for column in columns) + self._sampler.nbytes
 
     def check(self, chunk: Chunk) -> None:
-        """Raise WireError where the chunk does not fit this table."""
+        """Raise WireError unless the chunk fits this table."""
         num_rows, record_bytes = chunk.records.shape
         tail = num_rows - len(chunk)
         if record_bytes != self._rows.shape[1] or tail != self._window - 1:
@@ -156,7 +169,7 @@ class Table:
             raise WireError(f"{len(chunk)} transitions exceed the capacity {self._capacity}")
 
     def insert(self, chunk: Chunk) -> None:
-        """Append the chunk's transitions; the oldest chunks make room."""
+        """Append the chunk's transitions; evict the oldest chunks to make room."""
         self.check(chunk)
         length, oldest = len(chunk), self.first_key
         while len(self) + length > self._capacity:
@@ -171,72 +184,72 @@ class Table:
         rest_row = first_row + length
         if num_rows == length:
             rest_row = self._set_apart(extent, chunk.records[length:])
-        slots = (self._next_key + np.arange(length)) % self._capacity
-        self._start_rows[slots] = first_row + np.arange(length)
-        self._num_own[slots] = np.minimum(self._window, length - np.arange(length))
-        self._rest_rows[slots] = rest_row
-        self._actions[slots] = chunk.actions
-        self._rewards[slots] = chunk.rewards
-        self._discounts[slots] = chunk.discounts
-        self._bootstrap_offsets[slots] = chunk.bootstrap_offsets
-        self._weights_versions[slots] = chunk.weights_version
+        places = (self._next_key + np.arange(length)) % self._capacity
+        self._start_rows[places] = first_row + np.arange(length)
+        self._num_own[places] = np.minimum(self._window, length - np.arange(length))
+        self._rest_rows[places] = rest_row
+        self._actions[places] = chunk.actions
+        self._rewards[places] = chunk.rewards
+        self._discounts[places] = chunk.discounts
+        self._bootstrap_offsets[places] = chunk.bootstrap_offsets
+        self._weights_versions[places] = chunk.weights_version
         self._extents.append(extent)
         self._next_key += length
         self._next_row = first_row + num_rows
         self._sampler.insert(range(self._next_key - length, self._next_key), chunk.priorities)
 
     def update_priorities(self, keys: Int64Array, priorities: Float32Array) -> int:
-        """Give transitions new absolute TD errors, both [N]; how many of them were taken.
+        """Set transitions' absolute TD errors, both [N]; return how many were used.
 
-        Those that were evicted meanwhile are ignored; so are all where sampling is uniform.
+        Evicted transitions are ignored; with uniform sampling, all are.
         """
-        there = (keys >= self.first_key) & (keys < self._next_key)
-        return self._sampler.update(keys[there], priorities[there])
+        present = (keys >= self.first_key) & (keys < self._next_key)
+        return self._sampler.update(keys[present], priorities[present])
 
     def sample_bytes(self, size: int) -> int:
-        """Length of the records of `size` transitions."""
+        """Bytes of the records of `size` transitions."""
         return size * self._window * int(self._rows.shape[1])
 
     def sample(self, size: int, out: memoryview | None = None) -> Samples:
-        """`size` transitions as the sampler draws them; ValueError when the table is empty.
+        """Sample `size` transitions; raises ValueError when the table is empty.
 
-        out: memory of `sample_bytes` for their records.
+        out: memory of `sample_bytes` for their records; None: new memory.
         """
         if len(self) == 0:
             raise ValueError("cannot sample from an empty table")
         keys, probabilities = self._sampler.sample(self.keys, size)
-        slots = keys % self._capacity
+        places = keys % self._capacity
         return Samples(
             keys=keys,
             probabilities=probabilities,
             table_size=len(self),
             total_priority=self._sampler.total(self.keys),
-            actions=self._actions[slots],
-            rewards=self._rewards[slots],
-            discounts=self._discounts[slots],
-            bootstrap_offsets=self._bootstrap_offsets[slots],
-            weights_versions=self._weights_versions[slots],
-            records=self._gather(slots, out),
+            actions=self._actions[places],
+            rewards=self._rewards[places],
+            discounts=self._discounts[places],
+            bootstrap_offsets=self._bootstrap_offsets[places],
+            weights_versions=self._weights_versions[places],
+            records=self._gather(places, out),
         )
 
-    def _window_rows(self, slots: Int64Array) -> Int64Array:
-        """Of the transitions in slots [B], int64 [B, W]."""
-        num_own = self._num_own[slots, None].astype(np.int64)
-        own = self._start_rows[slots, None] + self._in_window
-        rest = self._rest_rows[slots, None] - num_own + self._in_window
+    def _window_rows(self, places: Int64Array) -> Int64Array:
+        """Rows of the windows of the transitions at these places [B], int64 [B, W]."""
+        num_own = self._num_own[places, None].astype(np.int64)
+        own = self._start_rows[places, None] + self._in_window
+        rest = self._rest_rows[places, None] - num_own + self._in_window
         return np.where(self._in_window < num_own, own, rest)
 
-    def _gather(self, slots: Int64Array, out: memoryview | None) -> UInt8Array:
-        """The records [B, W, R] of the transitions in slots [B]."""
-        rows = self._window_rows(slots).reshape(-1)
+    def _gather(self, places: Int64Array, out: memoryview | None) -> UInt8Array:
+        """Records [B, W, R] of the transitions at these places [B]."""
+        rows = self._window_rows(places).reshape(-1)
         record_bytes = self._rows.shape[1]
         flat = None if out is None else np.frombuffer(out, np.uint8).reshape(-1, record_bytes)
-        # "clip" writes straight into `out`; the rows are all there.
+        # "clip" writes straight into `out`; every row exists.
         records: UInt8Array = self._rows.take(rows, axis=0, out=flat, mode="clip")
-        return records.reshape(len(slots), self._window, record_bytes)
+        return records.reshape(len(places), self._window, record_bytes)
 
     def _set_apart(self, extent: _Extent, tail: UInt8Array) -> int:
-        """Keep the chunk's tail until a chunk goes on with it; the first row where it lies."""
+        """Keep the chunk's tail until a chunk begins with it; return the tail's first row."""
         row = self._free_tails.pop()
         self._rows[row : row + len(tail)] = tail
         extent.tail_row, extent.tail_hash = row, hash(tail.tobytes())
@@ -244,10 +257,10 @@ class Table:
         return row
 
     def _hand_over(self, chunk: Chunk, first_row: int) -> None:
-        """Let the chunk that it goes on with, if there is one, use its rows from first_row."""
+        """Let the chunk that this one continues, if any, use its rows from first_row on."""
         overlap = self._window - 1
         if len(chunk) < overlap:
-            return  # its own tail would hold some of them
+            return  # its own tail would hold some of these rows
         head = chunk.records[:overlap]
         before = self._waiting.get(hash(head.tobytes()))
         if before is None or before.tail_row is None:
@@ -266,10 +279,10 @@ class Table:
                 del self._waiting[extent.tail_hash]
 
     def _make_room(self, num_rows: int) -> int:
-        """Evict until they fit; the first of `num_rows` free consecutive rows of the ring."""
+        """Evict until `num_rows` consecutive rows of the ring are free; return the first."""
         first_row = self._next_row
         if first_row + num_rows > self._num_ring_rows:
-            # The rows up to the end stay unused this time round.
+            # The rows up to the end of the ring stay unused until it wraps again.
             self._evict_rows(first_row, self._num_ring_rows)
             first_row = 0
         self._evict_rows(first_row, first_row + num_rows)
@@ -284,13 +297,13 @@ class Table:
         self._free_tail(self._extents.popleft())
 
     def check_invariants(self) -> None:
-        """Raise AssertionError where one of the module's invariants does not hold."""
+        """Raise AssertionError unless the module's invariants hold."""
         key = self.first_key
         overlap = self._window - 1
         taken = np.zeros(len(self._rows), bool)
         for extent in self._extents:
             if extent.first_key != key:
-                raise AssertionError(f"key {extent.first_key} follows where {key} is due")
+                raise AssertionError(f"key {extent.first_key} where {key} is due")
             key += extent.num_transitions
             spans = [(extent.first_row, extent.num_rows)]
             if extent.tail_row is not None:
@@ -300,12 +313,12 @@ class Table:
                     raise AssertionError("two chunks lie in the same rows")
                 taken[first : first + length] = True
         if key != self._next_key or len(self) > self._capacity:
-            raise AssertionError("keys are not the newest of all inserted, or exceed the capacity")
-        slots = np.arange(self.first_key, self._next_key) % self._capacity
-        if not taken[self._window_rows(slots)].all():
-            raise AssertionError("a transition touches rows of no chunk")
+            raise AssertionError("keys are not the newest inserted, or exceed the capacity")
+        places = np.arange(self.first_key, self._next_key) % self._capacity
+        if not taken[self._window_rows(places)].all():
+            raise AssertionError("a transition's window has rows outside all chunks")
         num_apart = int(taken[self._num_ring_rows :].sum()) // overlap
         all_tails = (len(self._rows) - self._num_ring_rows) // overlap
         if num_apart + len(self._free_tails) != all_tails:
-            raise AssertionError("a tail is neither free nor of a chunk")
+            raise AssertionError("a tail is neither free nor used by a chunk")
         self._sampler.check_invariants(self.keys)

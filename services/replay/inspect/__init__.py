@@ -1,1 +1,1 @@
-"""`mrcdrl replay inspect`: what the replay log of a run holds, read from its files."""
+"""`mrcdrl replay inspect`: show what the replay log of a run holds, read from its files."""

@@ -1,4 +1,4 @@
-"""A log's transitions as numpy arrays in one file; docs/inspect.md describes each of them."""
+"""Export a log's transitions as numpy arrays in one file; docs/inspect.md describes them."""
 
 import os
 from pathlib import Path
@@ -12,18 +12,18 @@ from mrcdrl.services.replay.inspect.contents import Contents
 
 
 def arrays(contents: Contents) -> dict[str, np.ndarray[Any, Any]]:
-    """By name; of a log read with its records.
+    """The arrays by name, from a log read with its records.
 
-    Raises RunDirectoryError where there is none, or where records or windows differ in size.
+    Raises RunDirectoryError if there is no transition, or if records or windows differ in size.
     """
     chunks = contents.chunks
     if not chunks:
-        raise RunDirectoryError("the log holds no transition to export")
+        raise RunDirectoryError("the log has no transitions to export")
     shapes = {(len(c.records) - len(c) + 1, c.records.shape[1]) for c in chunks}
     if len(shapes) > 1:
         raise RunDirectoryError(
-            "the log holds chunks of several arenas or agents; give the run's --config, so that "
-            "the others are left out"
+            "the log has chunks of several arenas or agents; give the run's --config to leave out "
+            "the others"
         )
     lengths = np.array([len(c) for c in chunks])
     rows = np.array([len(c.records) for c in chunks])
@@ -50,14 +50,14 @@ def arrays(contents: Contents) -> dict[str, np.ndarray[Any, Any]]:
 
 
 def write_export(path: Path, contents: Contents) -> int:
-    """Write them as .npz, whole or not at all; how many transitions those are."""
-    of = arrays(contents)
+    """Write the arrays as .npz, completely or not at all; return the number of transitions."""
+    by_name = arrays(contents)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
     try:
         with temporary.open("wb") as file:
-            np.savez(file, allow_pickle=False, **of)
+            np.savez(file, allow_pickle=False, **by_name)
         temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise RunDirectoryError(f"cannot write {path}: {reason(error)}") from error
-    return len(of["keys"])
+    return len(by_name["keys"])

@@ -1,4 +1,4 @@
-"""`mrcdrl replay inspect RUN`: what the log of a run holds, read from its files."""
+"""`mrcdrl replay inspect RUN`: show what the log of a run holds, read from its files."""
 
 import json
 import sys
@@ -14,18 +14,19 @@ from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.services.replay.inspect.contents import log_directory, read_contents
 from mrcdrl.services.replay.inspect.export import write_export
-from mrcdrl.services.replay.inspect.summary import digest
+from mrcdrl.services.replay.inspect.summary import summarize
 
 _BAR = 32
 
 
 def main(argv: Sequence[str]) -> int:
-    """Read and show; the exit code."""
-    parser = Parser(prog="mrcdrl replay inspect", description="What the replay log of a run holds.")
-    parser.add_argument("run", type=Path, help="the run's folder, or its name under --run-dir")
+    """Read the log and show it; return the exit code."""
+    description = "Show what the replay log of a run holds."
+    parser = Parser(prog="mrcdrl replay inspect", description=description)
+    parser.add_argument("run", type=Path, help="the run directory, or its name under --run-dir")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
-    parser.add_argument("--shard", type=int, default=0, help="of the replay services, by default 0")
-    parser.add_argument("--config", help="a preset or a TOML file; by default the run's")
+    parser.add_argument("--shard", type=int, default=0, help="the replay shard; default: 0")
+    parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--export", type=Path, metavar="FILE.npz", help="write the transitions")
     add_config_flags(parser)
@@ -34,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
     directory = log_directory(run, arguments.shard)
     config = _config(run, arguments.config, overrides(arguments))
     contents = read_contents(directory, config, records=arguments.export is not None)
-    found = {"log": str(directory), **digest(contents)}
+    found = {"log": str(directory), **summarize(contents)}
     if arguments.json:
         print(json.dumps(found))
     else:
@@ -46,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _config(run: Path, source: str | None, given: dict[str, str]) -> Config | None:
-    """The run's configuration; None where it has none, as one whose services came up by hand."""
+    """The run's configuration; None if it has none, because its services were started by hand."""
     own = run / RUN_CONFIG
     if source is None and not given and not own.is_file():
         return None
@@ -54,7 +55,7 @@ def _config(run: Path, source: str | None, given: dict[str, str]) -> Config | No
 
 
 def show(found: dict[str, Any], console: Console) -> None:
-    """The digest for a reader."""
+    """Print the summary for a reader."""
     console.print(found["log"], highlight=False, soft_wrap=True)
     console.print(_facts(found))
     if found["actors"]:
@@ -81,7 +82,7 @@ def _facts(found: dict[str, Any]) -> Table:
 
 
 def _lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Each fact worth a line: what it is of, and the fact."""
+    """Yield the name and text of each line."""
     files, table, weights = found["files"], found["table"], found["weights"]
     yield "log", f"{found['transitions']} transitions in {found['chunks']} chunks"
     yield (
@@ -92,15 +93,15 @@ def _lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for count, what in (
         (files["torn_bytes"], "bytes after the last whole record: torn, or being written"),
         (files["corrupt_records"], "corrupt records"),
-        (files["left_out_chunks"], "chunks of another form, arena or agent"),
-        (files["duplicate_chunks"], "chunks that are there twice"),
+        (files["left_out_chunks"], "chunks of another schema, arena or agent"),
+        (files["duplicate_chunks"], "duplicate chunks"),
     ):
         if count:
             yield "damage", f"{count} {what}"
     if found["first_key"] is not None:
         yield "keys", f"{found['first_key']} to {found['last_key']}"
     if table is None:
-        yield "table", "not known: the run has no config.toml; give --config"
+        yield "table", "unknown: the run has no config.toml; give --config"
     else:
         samples = "" if table["samples"] is None else f", {table['samples']} samples"
         yield "table", f"{table['size']} of {table['capacity']} transitions after a start"
@@ -129,12 +130,12 @@ def _actors(actors: Sequence[dict[str, Any]]) -> Table:
 
 
 def _bars(spread: dict[str, Any]) -> Table:
-    """A histogram, a line a bin."""
+    """A histogram with one line per bin."""
     table = Table.grid(padding=(0, 2))
-    most = max(spread["counts"])
+    highest = max(spread["counts"])
     for low, high, count in zip(
         spread["edges"][:-1], spread["edges"][1:], spread["counts"], strict=True
     ):
-        bar = "█" * round(_BAR * count / most) or ("▏" if count else "")
+        bar = "█" * round(_BAR * count / highest) or ("▏" if count else "")
         table.add_row(f"{low:.4g}", f"… {high:.4g}", bar, str(count))
     return table

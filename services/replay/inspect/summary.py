@@ -1,6 +1,6 @@
-"""What a log holds, in numbers: plain values for JSON, named and explained in docs/inspect.md.
+"""Summarize a log in plain values for JSON; docs/inspect.md explains each name.
 
-Invariant: pure; a number that nothing can be said of is None.
+Invariant: pure; an unknown number is None.
 """
 
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ from mrcdrl.services.replay.inspect.contents import Contents, Rebuilt
 _BINS = 12
 
 
-def digest(contents: Contents) -> dict[str, Any]:
-    """All of it."""
+def summarize(contents: Contents) -> dict[str, Any]:
+    """All fields of the summary."""
     chunks = contents.chunks
     return {
         "files": asdict(contents.files),
@@ -31,14 +31,14 @@ def digest(contents: Contents) -> dict[str, Any]:
         "rewards": histogram(_column(chunks, "rewards")),
         "terminations": int((_column(chunks, "discounts") == 0).sum()),
         "actions": np.bincount(_column(chunks, "actions"), minlength=NUM_ACTIONS).tolist(),
-        "actors": [_actor(name, of) for name, of in _by_actor(chunks).items()],
+        "actors": [_actor(*item) for item in _by_actor(chunks).items()],
     }
 
 
 def histogram(values: NDArray[Any], *, logarithmic: bool = False) -> dict[str, Any] | None:
-    """How numbers are spread; None where there are none.
+    """Range, median, mean and bins of numbers; None if there are none.
 
-    logarithmic: bins of equal ratio over those above 0; the others stand in the first.
+    logarithmic: bins of equal ratio over the positive numbers; the first bin also has the others.
     """
     if len(values) == 0:
         return None
@@ -47,7 +47,7 @@ def histogram(values: NDArray[Any], *, logarithmic: bool = False) -> dict[str, A
     if logarithmic and exact.max() > 0:
         shown = np.log10(np.maximum(exact, exact[exact > 0].min()))
     low, high, bins = shown.min(), shown.max(), _BINS
-    if np.issubdtype(values.dtype, np.integer):  # whole numbers, whole edges
+    if np.issubdtype(values.dtype, np.integer):  # integers get integer edges
         width = -(-(high - low + 1) // _BINS)
         bins = int(-(-(high - low + 1) // width))
         high = low + bins * width
@@ -77,7 +77,7 @@ def _table(rebuilt: Rebuilt) -> dict[str, Any]:
 
 
 def _priorities(contents: Contents) -> dict[str, Any]:
-    """Of the table, as the snapshot has them; without a table, of the log, from the actors."""
+    """The table's priorities, from the snapshot; without a table, the actors' in the log."""
     rebuilt = contents.rebuilt
     if rebuilt is not None and len(rebuilt.priorities):
         source = "actors" if rebuilt.snapshot is None else "snapshot"
@@ -88,7 +88,7 @@ def _priorities(contents: Contents) -> dict[str, Any]:
 
 
 def _weights(chunks: Sequence[Chunk]) -> dict[str, Any] | None:
-    """Versions that acted, and how far each transition's is behind the newest."""
+    """Versions that acted, and how far each transition's version is behind the newest."""
     if not chunks:
         return None
     versions = np.repeat([c.weights_version for c in chunks], [len(c) for c in chunks])
@@ -100,14 +100,14 @@ def _weights(chunks: Sequence[Chunk]) -> dict[str, Any] | None:
 
 
 def _by_actor(chunks: Sequence[Chunk]) -> dict[str, list[Chunk]]:
-    found: dict[str, list[Chunk]] = {}
+    by_actor: dict[str, list[Chunk]] = {}
     for chunk in chunks:
-        found.setdefault(chunk.actor, []).append(chunk)
-    return dict(sorted(found.items()))
+        by_actor.setdefault(chunk.actor, []).append(chunk)
+    return dict(sorted(by_actor.items()))
 
 
 def _actor(name: str, chunks: Sequence[Chunk]) -> dict[str, Any]:
-    """What came from one actor."""
+    """One actor's chunks in numbers."""
     last: dict[int, int] = {}
     gaps = 0
     for chunk in chunks:
@@ -125,6 +125,6 @@ def _actor(name: str, chunks: Sequence[Chunk]) -> dict[str, Any]:
 
 
 def _column(chunks: Sequence[Chunk], name: str) -> NDArray[Any]:
-    """One value a transition [num_transitions], of those chunks that have it."""
-    nothing: Float32Array = np.empty(0, np.uint8 if name == "actions" else np.float32)
-    return np.concatenate([getattr(c, name) for c in chunks] or [nothing])
+    """One value per transition, from the chunks that have it."""
+    empty: Float32Array = np.empty(0, np.uint8 if name == "actions" else np.float32)
+    return np.concatenate([getattr(c, name) for c in chunks] or [empty])

@@ -44,19 +44,9 @@ class SimulatedLearner:
         self._stop = StopSignal()
         session.announce(keys.live("learner", plan.workers[0]))
         self._weights = WeightsWriter(session, keys)
-        settings = config.learner
-        self._reader = ReplayReader(
-            bulk,
-            keys,
-            settings.batch_size,
-            settings.sample_size // settings.batch_size,
-            settings.requests_in_flight,
-            settings.warn_s,
-            self._stop,
-            num_shards=config.replay.shards,
-        )
+        self._reader = ReplayReader.from_config(bulk, keys, config, self._stop)
         self._priorities = (
-            PriorityWriter(bulk, keys, self._stop, num_shards=config.replay.shards)
+            PriorityWriter.from_config(bulk, keys, config, self._stop)
             if config.replay.prioritized
             else None
         )

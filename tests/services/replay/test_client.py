@@ -1,22 +1,22 @@
-"""The writer's patience with a replay service at which too many wait already."""
+"""The writer's patience with a replay service at which too many requests are waiting."""
 
-import numpy as np
 import pytest
 
 from mrcdrl.common.errors import ThrottledError
-from mrcdrl.common.messages.trajectory import Chunk, InsertReply
+from mrcdrl.common.messages.trajectory import InsertReply
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.replay import client
 from mrcdrl.services.replay.client import ReplayWriter
+from tests.services.replay.harness import make_chunk
 
 
 class FakeReplay:
-    """Session, client and answer in one: holds so many requests at once, then acknowledges."""
+    """Session, client and answer in one: throttles some requests at once, then acknowledges."""
 
-    def __init__(self, holds: int) -> None:
-        self.holds = holds
+    def __init__(self, throttles: int) -> None:
+        self.throttles = throttles
 
     def client(self, *_: object, **__: object) -> "FakeReplay":
         return self
@@ -28,8 +28,8 @@ class FakeReplay:
         return True
 
     def result(self) -> bytes:
-        self.holds -= 1
-        if self.holds >= 0:
+        self.throttles -= 1
+        if self.throttles >= 0:
             raise ThrottledError("256 requests are waiting")
         return encode(InsertReply(0, False, 3))
 
@@ -38,7 +38,7 @@ class FakeReplay:
 
 
 class Waits(StopSignal):
-    """Notes what is waited, and waits for nothing."""
+    """Notes each wait, and does not wait."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,22 +49,24 @@ class Waits(StopSignal):
         return False
 
 
-def insert(holds: int, stop: StopSignal) -> ReplayWriter:
-    octets, floats = np.ones(3, np.uint8), np.ones(3, np.float32)
-    chunk = Chunk("a", 1, 0, 0, np.zeros((4, 4), np.uint8), octets, floats, floats, octets, floats)
-    writer = ReplayWriter(FakeReplay(holds), Keys("run"), 10.0, stop)  # type: ignore[arg-type]
-    assert writer.insert([chunk]) is not None
+def insert(throttles: int, stop: StopSignal) -> ReplayWriter:
+    writer = ReplayWriter(FakeReplay(throttles), Keys("run"), 10.0, stop)  # type: ignore[arg-type]
+    assert writer.insert([make_chunk(0)]) is not None
     return writer
 
 
-def test_who_is_sent_away_at_once_asks_less_and_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_writer_throttled_at_once_asks_less_and_less_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(client.time, "monotonic", lambda: 100.0)
     stop = Waits()
     assert insert(7, stop).throttled == 7
     assert stop.seconds == pytest.approx([0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2])
 
 
-def test_who_was_let_wait_asks_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_writer_throttled_after_a_wait_asks_again_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     seconds = iter(range(0, 1000, 5))
     monkeypatch.setattr(client.time, "monotonic", lambda: float(next(seconds)))
     stop = Waits()

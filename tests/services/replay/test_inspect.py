@@ -1,4 +1,4 @@
-"""`mrcdrl replay inspect` says what a service would read back, and changes nothing."""
+"""`mrcdrl replay inspect` shows what a service would read back, and changes nothing."""
 
 import json
 from collections.abc import Sequence
@@ -15,54 +15,37 @@ from mrcdrl.common.messages.trajectory import Chunk
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.services.replay.inspect.main import main
 from mrcdrl.services.replay.log import SegmentLog
-from tests.services.replay.test_snapshot import (
+from tests.services.replay.harness import (
     CONFIG,
     LENGTH,
+    TAIL,
     insert,
+    make_chunk,
     save,
     settings,
     start,
     update,
 )
 
-WINDOW = CONFIG.arena.stack + CONFIG.agent.n_step
 
-
-def chunk(
-    sequence: int,
-    *,
-    actor: str = "a",
-    incarnation: int = 1,
-    version: int = 0,
-    priority: float | None = 1.0,
-    terminated: bool = False,
-) -> Chunk:
-    rows = WINDOW - 1 + LENGTH
-    return Chunk(
-        actor=actor,
-        incarnation=incarnation,
-        sequence=sequence,
-        weights_version=version,
-        records=np.full((rows, CONFIG.arena.record_bytes), sequence, np.uint8),
-        actions=(np.arange(LENGTH) % 3).astype(np.uint8),
-        rewards=np.full(LENGTH, sequence, np.float32),
-        discounts=np.full(LENGTH, 0.0 if terminated else 0.9, np.float32),
-        bootstrap_offsets=np.ones(LENGTH, np.uint8),
-        priorities=np.array([] if priority is None else [priority] * LENGTH, np.float32),
-    )
+def chunk(sequence: int, *, terminated: bool = False, **fields: Any) -> Chunk:
+    records = np.full((LENGTH + TAIL, CONFIG.arena.record_bytes), sequence, np.uint8)
+    discounts = np.full(LENGTH, 0.0 if terminated else 0.9, np.float32)
+    fields = {"priority": 1.0, "records": records, "discounts": discounts, **fields}
+    return make_chunk(sequence, **fields)
 
 
 CHUNKS = (
-    *(chunk(n, version=n) for n in range(4)),
-    *(chunk(n, actor="b", incarnation=2, version=5) for n in (0, 2, 5)),
-    chunk(0, actor="b", incarnation=3, version=6, terminated=True),
+    *(chunk(n, weights_version=n) for n in range(4)),
+    *(chunk(n, actor="b", incarnation=2, weights_version=5) for n in (0, 2, 5)),
+    chunk(0, actor="b", incarnation=3, weights_version=6, terminated=True),
 )
 
 
 def make_run(
     folder: Path, chunks: Sequence[Chunk] = CHUNKS, config: Config | None = CONFIG
 ) -> Path:
-    """A run's folder with a log, and a snapshot; the service that made it was killed."""
+    """A run directory with a log and a snapshot, left by a killed service."""
     directory = folder / "four" / "replay" / "0"
     service = start(directory)
     service._limiter.samples_per_insert = 0
@@ -124,11 +107,13 @@ def test_the_table_is_the_one_a_service_would_have(
     found = inspect(capsys, run)
     assert found["table"]["size"] == len(service._table) < found["transitions"]
     assert found["table"]["first_key"] == service._table.first_key
-    assert found["table"]["inserts"] == 60 * LENGTH == service.metrics()["inserts"]
-    assert found["table"]["samples"] == service.metrics()["samples"]
+    assert found["table"]["inserts"] == 60 * LENGTH == service.metrics().inserts
+    assert found["table"]["samples"] == service.metrics().samples
 
 
-def test_priorities_are_the_snapshots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_priorities_come_from_the_snapshot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = make_run(tmp_path)
     priorities = inspect(capsys, run)["priorities"]
     assert priorities["source"] == "snapshot"
@@ -163,7 +148,7 @@ def files_of(folder: Path) -> dict[Path, tuple[bytes, int]]:
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
 
 
-def test_damage_is_told_and_nothing_is_changed(
+def test_damage_is_reported_and_nothing_is_changed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = make_run(tmp_path)
@@ -227,7 +212,7 @@ def test_an_empty_log_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str
     run = make_run(tmp_path, [])
     assert main([str(run)]) == 0
     assert "0 transitions in 0 chunks" in capsys.readouterr().out
-    with pytest.raises(RunDirectoryError, match="no transition to export"):
+    with pytest.raises(RunDirectoryError, match="no transitions to export"):
         main([str(run), "--export", str(tmp_path / "none.npz")])
 
 
@@ -242,7 +227,7 @@ def test_exported_arrays_are_the_tables_transitions(
     rows = np.searchsorted(found["keys"], samples.keys)
     assert (found["keys"][rows] == samples.keys).all()
     window = int(found["window"])
-    assert window == WINDOW
+    assert window == TAIL + 1
     spans = found["start_rows"][rows][:, None] + np.arange(window)
     np.testing.assert_array_equal(found["records"][spans], samples.records)
     for name in ("actions", "rewards", "discounts", "bootstrap_offsets", "weights_versions"):
@@ -256,13 +241,13 @@ def test_exported_arrays_are_the_tables_transitions(
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["nobody"], r"nobody is no run's folder"),
+        (["nobody"], r"nobody is not a directory"),
         (["bare"], r"bare has no replay log: .*replay/0 is missing$"),
-        (["four", "--shard", "3"], r"replay/3 is missing; there are the shards 0"),
+        (["four", "--shard", "3"], r"replay/3 is missing; its shards are 0"),
         (["four", "--export", "missing/x.npz"], r"cannot write missing/x.npz: No such file"),
     ],
 )
-def test_what_is_not_there_is_one_clear_error(
+def test_what_is_missing_is_one_clear_error(
     tmp_path: Path, arguments: list[str], reason: str
 ) -> None:
     make_run(tmp_path)
@@ -284,4 +269,4 @@ def test_it_is_a_command_of_two_words(
     assert "128 transitions" in capsys.readouterr().out
     monkeypatch.setattr("sys.argv", ["mrcdrl", "replay", "inspect", "nobody"])
     assert cli.main() == 1
-    assert capsys.readouterr().err == "mrcdrl: runs/nobody is no run's folder\n"
+    assert capsys.readouterr().err == "mrcdrl: runs/nobody is not a directory\n"

@@ -1,4 +1,4 @@
-"""The limiter holds both sides to the ratio, and one of them may always go on."""
+"""The limiter keeps both sides at the ratio, and one of them may always proceed."""
 
 import hypothesis.strategies as st
 import pytest
@@ -38,8 +38,8 @@ class TwoSides(RuleBasedStateMachine):
                 self.limiter.samples += count
 
     @rule(lost=st.integers(0, 500), ratio=st.sampled_from([0.5, 1.0, 4.0, 8.0]))
-    def go_on_in_another_process(self, lost: int, ratio: float) -> None:
-        """The last samples were not noted, and the ratio may be another now."""
+    def continue_in_another_process(self, lost: int, ratio: float) -> None:
+        """The last samples were not saved, and the ratio may have changed."""
         before = self.limiter
         tolerance = before.error_buffer / (before.min_size * before.samples_per_insert)
         self.limiter = RateLimiter.with_tolerance(
@@ -63,7 +63,7 @@ class TwoSides(RuleBasedStateMachine):
         assert abs(due - limiter.samples) <= limiter.error_buffer
 
     @invariant()
-    def one_side_may_go_on_with_its_largest_request(self) -> None:
+    def one_side_may_make_its_largest_request(self) -> None:
         limiter = self.limiter
         assert limiter.can_insert(self.largest_insert) or limiter.can_sample(self.largest_sample)
 
@@ -72,7 +72,7 @@ TestTwoSides = TwoSides.TestCase
 TestTwoSides.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
 
 
-def test_nothing_is_sampled_before_min_size_and_inserts_go_on_meanwhile() -> None:
+def test_nothing_is_sampled_before_min_size_and_inserts_continue_meanwhile() -> None:
     limiter = RateLimiter(8.0, 1000, 500.0, 50, 32)
     for _ in range(19):
         assert limiter.can_insert(50)
@@ -109,8 +109,8 @@ def test_the_ratio_counts_from_the_first_insert_that_could_be_sampled() -> None:
 @pytest.mark.parametrize(
     ("ratio", "min_size", "buffer", "insert", "sample", "reason"),
     [
-        (8.0, 1000, 399.0, 50, 32, "399 samples of lead, one request moves 400"),
-        (0.5, 1000, 31.0, 50, 32, "wait for each other for ever"),
+        (8.0, 1000, 399.0, 50, 32, "a lead of 399 samples, one request moves 400"),
+        (0.5, 1000, 31.0, 50, 32, "wait for each other forever"),
         (-1.0, 1000, 1e6, 50, 32, "samples_per_insert >= 0"),
         (1.0, 0, 1e6, 50, 32, "min_size >= 1"),
     ],
@@ -125,7 +125,7 @@ def test_settings_that_would_deadlock_are_refused(
 @pytest.mark.parametrize(
     ("tolerance", "buffer"), [(0.1, 0.1 * 50_000 * 8), (0.0, 2 * 8 * 50), (1e-9, 2 * 8 * 50)]
 )
-def test_the_tolerance_is_a_share_of_min_size_but_two_requests_at_least(
+def test_the_tolerance_scales_with_min_size_but_allows_two_requests(
     tolerance: float, buffer: float
 ) -> None:
     limiter = RateLimiter.with_tolerance(8.0, 50_000, tolerance, 50, 32)

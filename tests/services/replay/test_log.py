@@ -1,4 +1,4 @@
-"""The segment log: what is appended comes back, whatever cuts the writer off."""
+"""The segment log: what is appended comes back, whatever interrupts the writer."""
 
 import errno
 import os
@@ -57,13 +57,15 @@ def test_a_record_is_a_length_a_crc_32_and_the_payload(tmp_path: Path) -> None:
 
 
 def test_any_number_of_records_is_appended_at_once(tmp_path: Path) -> None:
-    payloads = [n.to_bytes(2, "big") for n in range(1500)]  # of two parts each: more than a call's
+    payloads = [
+        n.to_bytes(2, "big") for n in range(1500)
+    ]  # two parts each: more than one call takes
     log = open_log(tmp_path)
     log.append(payloads, 0, 10 * len(payloads))
     assert recover(open_log(tmp_path)) == payloads
 
 
-def test_a_reopened_log_goes_on(tmp_path: Path) -> None:
+def test_a_reopened_log_continues(tmp_path: Path) -> None:
     write(tmp_path, PAYLOADS[:5])
     write(tmp_path, PAYLOADS[5:], first_key=50)
     assert recover(open_log(tmp_path)) == PAYLOADS
@@ -79,7 +81,7 @@ def test_an_unclosed_log_keeps_every_appended_record(tmp_path: Path) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(cut=st.integers(1, 47))
-def test_a_torn_tail_is_cut_off_and_the_log_goes_on(
+def test_a_torn_tail_is_cut_off_and_the_log_continues(
     tmp_path_factory: pytest.TempPathFactory, cut: int
 ) -> None:
     directory = tmp_path_factory.mktemp("log")
@@ -91,13 +93,13 @@ def test_a_torn_tail_is_cut_off_and_the_log_goes_on(
 
 
 def test_zeros_at_the_end_are_a_torn_tail(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """What a power cut leaves of a file that grew, but whose bytes were not on the disk yet."""
+    """A power cut leaves zeros in a file that grew before its bytes reached the disk."""
     write(tmp_path, PAYLOADS[:2])
     (segment,) = segments(tmp_path)
     with segment.open("ab") as file:
         file.write(bytes(1000))
     assert recover(open_log(tmp_path)) == PAYLOADS[:2]
-    assert f"{segment}: torn tail of 1000 bytes cut off" in caplog.text
+    assert f"{segment}: cut off a torn tail of 1000 bytes" in caplog.text
 
 
 def test_a_corrupt_record_is_skipped_counted_and_named(
@@ -111,10 +113,10 @@ def test_a_corrupt_record_is_skipped_counted_and_named(
     log = open_log(tmp_path)
     assert recover(log) == PAYLOADS[1:]
     assert log.corrupt == 1
-    assert f"{first}: record at byte 0 is corrupt" in caplog.text
+    assert f"{first}: skipped a corrupt record at byte 0" in caplog.text
 
 
-def test_segments_go_when_all_of_them_is_evicted(tmp_path: Path) -> None:
+def test_segments_are_deleted_when_all_of_them_is_evicted(tmp_path: Path) -> None:
     log = open_log(tmp_path)
     for number, payload in enumerate(PAYLOADS):
         log.append([payload], 10 * number, 10)

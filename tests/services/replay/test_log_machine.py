@@ -1,4 +1,4 @@
-"""The segment log against a plain list of what was acknowledged, whatever cuts writers off."""
+"""The segment log against a plain list of what was acknowledged, whatever interrupts writers."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ PER_PAYLOAD = 10  # transitions that each payload stands for
 
 
 class LogAgainstList(RuleBasedStateMachine):
-    """Payloads are unlike one another; the list holds those that must come back, oldest first."""
+    """All payloads differ; the list holds those that must come back, oldest first."""
 
     @initialize(segment_bytes=st.integers(1, 400), fsync=st.booleans())
     def make(self, segment_bytes: int, fsync: bool) -> None:
@@ -68,7 +68,7 @@ class LogAgainstList(RuleBasedStateMachine):
                 self.log.append(payloads, self.key(len(self.model)), PER_PAYLOAD * len(payloads))
             except OSError:
                 return
-        raise AssertionError("a failed write was taken for a whole one")
+        raise AssertionError("a failed write counted as complete")
 
     @rule(close=st.booleans())
     def start_again(self, close: bool) -> None:
@@ -80,7 +80,7 @@ class LogAgainstList(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def die_in_a_write(self, data: st.DataObject) -> None:
-        """Of the record under way some bytes are there, or zeros where they were to be."""
+        """Part of the record being written reached the file, or zeros in its place."""
         if not (paths := segment_paths(self.directory)):
             return
         record = len(payload := self.payload(30)).to_bytes(4, "little") + b"crc?" + payload
@@ -92,7 +92,7 @@ class LogAgainstList(RuleBasedStateMachine):
     @precondition(lambda self: self.model)
     @rule(data=st.data())
     def flip_a_bit_of_a_payload(self, data: st.DataObject) -> None:
-        """That record is lost, and no other."""
+        """Only that record is lost."""
         index = data.draw(st.integers(0, len(self.model) - 1))
         payload = self.model.pop(index)
         self.flip(payload, data.draw(st.integers(-32, 8 * len(payload) - 1)))  # its CRC too
@@ -102,7 +102,7 @@ class LogAgainstList(RuleBasedStateMachine):
     @precondition(lambda self: self.model)
     @rule(data=st.data())
     def flip_a_bit_of_a_length(self, data: st.DataObject) -> None:
-        """Where the next record begins is not known: those of the same file may go with it."""
+        """The next record's begin is unknown: later ones in the file may be lost too."""
         index = data.draw(st.integers(0, len(self.model) - 1))
         payload = self.model[index]
         path = self.flip(payload, data.draw(st.integers(-64, -33)))
@@ -129,11 +129,11 @@ class LogAgainstList(RuleBasedStateMachine):
     @precondition(lambda self: self.model)
     @rule(data=st.data())
     def forget(self, data: st.DataObject) -> None:
-        """Whole files go, and only of what is older than the key."""
+        """Only whole files are deleted, with nothing newer than the key."""
         index = data.draw(st.integers(0, len(self.model)))
         self.log.forget(self.key(index))
-        there = b"".join(path.read_bytes() for path in segment_paths(self.directory))
-        kept = [payload for payload in self.model if payload in there]
+        files = b"".join(path.read_bytes() for path in segment_paths(self.directory))
+        kept = [payload for payload in self.model if payload in files]
         assert kept == self.model[len(self.model) - len(kept) :]
         assert len(kept) >= len(self.model) - index
         self.first += PER_PAYLOAD * (len(self.model) - len(kept))

@@ -1,6 +1,6 @@
-"""What a learner gets of a prioritized table, after evictions, updates and a restart.
+"""What a learner gets from a prioritized table, after evictions, updates and a restart.
 
-The sampler alone is in test_sampler.py.
+test_sampler.py tests the sampler alone.
 """
 
 from pathlib import Path
@@ -12,14 +12,14 @@ from mrcdrl.common.messages.trajectory import Float64Array, Samples
 from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.services.learner.batch import importance_weights
 from mrcdrl.services.replay.service import ReplayService
-from tests.services.replay.test_snapshot import CONFIG, LENGTH, chunk, insert, save, start
+from tests.services.replay.harness import CONFIG, LENGTH, insert, make_chunk, save, start
 
 BATCH, BATCHES = 64, 1500
 EXPONENT = CONFIG.replay.priority_exponent
 LIMIT = 649  # 99.999 % of chi-square with up to 500 degrees of freedom
 
 
-@pytest.fixture(scope="module", params=["as it was", "started again"])
+@pytest.fixture(scope="module", params=["as it was", "restarted"])
 def service(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> ReplayService:
@@ -27,7 +27,7 @@ def service(
     folder: Path = tmp_path_factory.mktemp("log")
     made = start(folder)
     made._limiter.samples_per_insert = 0
-    insert(made, *(chunk(n, initial=1.0) for n in range(50)))
+    insert(made, *(make_chunk(n, priority=1.0) for n in range(50)))
     table = made._table
     keys = np.array(table.keys)
     assert table.update_priorities(keys, priorities(made).astype(np.float32)) == len(keys)
@@ -36,14 +36,14 @@ def service(
 
 
 def priorities(service: ReplayService) -> Float64Array:
-    """Of the table's transitions, by definition: a few large ones, many small ones."""
+    """Priorities of the table's transitions: a few large ones, many small ones."""
     rng = np.random.default_rng(1)
     of_all: Float64Array = rng.lognormal(0, 1.5, 50 * LENGTH)
     return of_all[service._table.first_key :]
 
 
-def draw(service: ReplayService) -> list[Samples]:
-    """Mini-batches, as they come out of the wire."""
+def sample(service: ReplayService) -> list[Samples]:
+    """Mini-batches as they come off the wire."""
     return [
         decode(Samples, encode(service._table.sample(BATCH)))  # as the learner reads them
         for _ in range(BATCHES)
@@ -53,22 +53,23 @@ def draw(service: ReplayService) -> list[Samples]:
 def test_frequencies_follow_the_priorities(service: ReplayService) -> None:
     first = service._table.first_key
     assert first > 0
-    batches = draw(service)
-    shares = (priorities(service) + 1e-6) ** EXPONENT
-    shares /= shares.sum()
-    counts = np.zeros(len(shares))
+    batches = sample(service)
+    probabilities = (priorities(service) + 1e-6) ** EXPONENT
+    probabilities /= probabilities.sum()
+    counts = np.zeros(len(probabilities))
     for batch in batches:
         np.add.at(counts, batch.keys - first, 1)
-        np.testing.assert_allclose(batch.probabilities, shares[batch.keys - first], rtol=1e-5)
-        assert batch.table_size == len(shares)
-    expected = shares * BATCH * BATCHES
+        expected = probabilities[batch.keys - first]
+        np.testing.assert_allclose(batch.probabilities, expected, rtol=1e-5)
+        assert batch.table_size == len(probabilities)
+    expected = probabilities * BATCH * BATCHES
     assert ((counts - expected) ** 2 / expected).sum() < LIMIT
-    uniform = BATCH * BATCHES / len(shares)
+    uniform = BATCH * BATCHES / len(probabilities)
     assert ((counts - uniform) ** 2 / uniform).sum() > 20 * LIMIT
 
 
 def test_importance_weights_give_the_uniform_mean_back(service: ReplayService) -> None:
-    """Of what grows with the priority, and of the rewards: with beta = 1, of all batches."""
+    """Means of a number that grows with the priority, and of rewards, with beta = 1."""
     first = service._table.first_key
     table_of = {
         "priority": np.sqrt(priorities(service)),
@@ -76,15 +77,15 @@ def test_importance_weights_give_the_uniform_mean_back(service: ReplayService) -
     }
     sums, weight = dict.fromkeys(table_of, 0.0), 0.0
     plain = dict.fromkeys(table_of, 0.0)
-    for batch in draw(service):
+    for batch in sample(service):
         exact = 1 / (batch.table_size * batch.probabilities)
         weights = importance_weights(batch, 1.0)
         np.testing.assert_allclose(weights / weights.max(), exact / exact.max(), rtol=1e-5)
         weight += exact.sum()
         for name, column in table_of.items():
-            drawn = column[batch.keys - first]
-            sums[name] += float((exact * drawn).sum())
-            plain[name] += float(drawn.mean()) / BATCHES
+            sampled = column[batch.keys - first]
+            sums[name] += float((exact * sampled).sum())
+            plain[name] += float(sampled.mean()) / BATCHES
     for name, column in table_of.items():
         assert sums[name] / weight == pytest.approx(column.mean(), rel=0.01), name
     assert plain["priority"] > 1.3 * table_of["priority"].mean()

@@ -1,4 +1,4 @@
-"""What sequence numbers say of chunks."""
+"""What sequence numbers say about chunks."""
 
 import pytest
 from hypothesis import settings
@@ -28,21 +28,21 @@ def test_a_stream(stored: list[int], arriving: int, expected: Arrival) -> None:
     assert book.classify("actor-0", 1, arriving) is expected
 
 
-def test_actors_and_incarnations_have_streams_of_their_own() -> None:
+def test_each_actor_and_incarnation_has_its_own_stream() -> None:
     book = SequenceBook()
     book.record("actor-0", 1, 4)
     assert book.classify("actor-0", 2, 0) is Arrival.NEXT
-    assert book.classify("actor-0", 0, 0) is Arrival.NEXT  # its clock was put back meanwhile
+    assert book.classify("actor-0", 0, 0) is Arrival.NEXT  # its clock was set back meanwhile
     assert book.classify("actor-1", 1, 0) is Arrival.NEXT
 
 
-def test_to_classify_stores_nothing() -> None:
+def test_classifying_stores_nothing() -> None:
     book = SequenceBook()
     assert book.classify("a", 1, 0) is Arrival.NEXT
     assert book.classify("a", 1, 0) is Arrival.NEXT
 
 
-def test_the_stream_heard_of_least_recently_is_forgotten() -> None:
+def test_the_stream_heard_from_least_recently_is_forgotten() -> None:
     book = SequenceBook(max_streams=2)
     book.record("a", 1, 0)
     book.record("b", 1, 0)
@@ -54,7 +54,7 @@ def test_the_stream_heard_of_least_recently_is_forgotten() -> None:
 
 
 class BookAgainstList(RuleBasedStateMachine):
-    """Every chunk ever stored stands in a list, of the streams that are not forgotten."""
+    """Lists every stored chunk of the streams that are not forgotten."""
 
     @initialize(max_streams=st.integers(1, 4))
     def make(self, max_streams: int) -> None:
@@ -69,7 +69,7 @@ class BookAgainstList(RuleBasedStateMachine):
         ahead=st.booleans(),
     )
     def arrive(self, actor: str, incarnation: int, sequence: int, ahead: bool) -> None:
-        """As the service does: what is new is stored, what was there before is not."""
+        """Store new chunks and skip repeated ones, as the service does."""
         stream = (actor, incarnation)
         known = [n for of, n in self.stored if of == stream]
         newest = max(known, default=-1)

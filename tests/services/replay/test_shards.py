@@ -1,4 +1,4 @@
-"""Several shards are one table to those who use them: real services over real sessions."""
+"""Several shards act as one table for their users: real services over real sessions."""
 
 import threading
 import time
@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from mrcdrl.common.config import Config, TransportConfig
-from mrcdrl.common.messages.trajectory import Chunk, Priorities, Samples
+from mrcdrl.common.messages.trajectory import Priorities, Samples
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.replay.build import build
 from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWriter, shard_of
+from mrcdrl.services.replay.limiter import RateLimiter
 from mrcdrl.services.replay.service import ReplayService
+from mrcdrl.services.replay.table import Table
+from tests.services.replay.harness import make_chunk
 
 _DEADLINE_S = 30.0
 KEYS = Keys("shards")
@@ -42,7 +44,7 @@ def config_of(num_shards: int) -> Config:
 
 @contextmanager
 def shard_up(config: Config, endpoint: str, shard: int) -> Iterator[ReplayService]:
-    table, limiter = build(config)
+    table, limiter = Table.from_config(config), RateLimiter.from_config(config)
     with Session(config.transport.model_copy(update={"connect": (endpoint,)})) as session:
         keys = (KEYS.insert(shard), KEYS.sample(shard), KEYS.priorities(shard))
         service = ReplayService(config, table, limiter, *map(session.server, keys))
@@ -67,22 +69,18 @@ def session(router: str) -> Iterator[Session]:
 
 
 def fill(session: Session, config: Config, shard: int, count: int, priority: float) -> None:
-    """`count` transitions whose reward is their shard's number."""
+    """Insert `count` transitions whose reward is their shard's number."""
     writer = ReplayWriter(session, KEYS, 10.0, StopSignal(), shard=shard, num_shards=9)
-    length, arena = 40, config.arena
-    rows = arena.stack - 1 + length + config.agent.n_step
+    length, tail = 40, config.arena.stack - 1 + config.agent.n_step
     for sequence in range(count // length):
-        chunk = Chunk(
-            actor="a",
+        chunk = make_chunk(
+            sequence,
+            length,
+            tail=tail,
+            record_bytes=config.arena.record_bytes,
+            priority=priority,
             incarnation=shard,
-            sequence=sequence,
-            weights_version=0,
-            records=np.full((rows, arena.record_bytes), sequence, np.uint8),
-            actions=np.zeros(length, np.uint8),
             rewards=np.full(length, shard, np.float32),
-            discounts=np.ones(length, np.float32),
-            bootstrap_offsets=np.ones(length, np.uint8),
-            priorities=np.full(length, priority, np.float32),
         )
         assert writer.insert([chunk]) is not None
 
@@ -94,7 +92,7 @@ def reader_of(
     return ReplayReader(session, KEYS, *settings, num_shards=num_shards, seed=3, late_s=late_s)
 
 
-def draw(reader: ReplayReader, num_batches: int) -> list[Samples]:
+def sample(reader: ReplayReader, num_batches: int) -> list[Samples]:
     batches = []
     for _ in range(num_batches):
         batch = reader.sample()
@@ -103,8 +101,8 @@ def draw(reader: ReplayReader, num_batches: int) -> list[Samples]:
     return batches
 
 
-def shares(batches: list[Samples]) -> dict[int, float]:
-    """Of all batches, those of each shard."""
+def frequencies(batches: list[Samples]) -> dict[int, float]:
+    """The part of the batches that came from each shard."""
     found = [int(batch.rewards[0]) for batch in batches]
     return {shard: found.count(shard) / len(found) for shard in set(found)}
 
@@ -114,11 +112,11 @@ def test_batches_come_in_proportion_to_the_shards_priorities(router: str, sessio
     with shard_up(config, router, 0), shard_up(config, router, 1):
         fill(session, config, 0, 200, priority=1.0)
         fill(session, config, 1, 200, priority=3.0)
-        reader = reader_of(session, 2, late_s=_DEADLINE_S)  # a busy one is none that is away
-        draw(reader, 40 * BATCHES)  # until both have told of their priorities
-        batches = draw(reader, 400 * BATCHES)
-    drawn = 0.95 * 0.75 + 0.05 / 2
-    assert shares(batches)[1] == pytest.approx(drawn, abs=0.08)
+        reader = reader_of(session, 2, late_s=_DEADLINE_S)  # a busy shard is not an unreachable one
+        sample(reader, 40 * BATCHES)  # until both totals are known
+        batches = sample(reader, 400 * BATCHES)
+    probability = 0.95 * 0.75 + 0.05 / 2
+    assert frequencies(batches)[1] == pytest.approx(probability, abs=0.08)
     for batch in batches:
         assert len(set(batch.rewards.tolist())) == 1
         shard = int(batch.rewards[0])
@@ -126,8 +124,8 @@ def test_batches_come_in_proportion_to_the_shards_priorities(router: str, sessio
         assert (batch.keys // 2 < 200).all()
         assert batch.table_size == 400
         assert batch.total_priority == pytest.approx(800, rel=1e-3)
-        share = (1 - drawn, drawn)[shard]
-        np.testing.assert_allclose(batch.probabilities, share / 200, rtol=1e-3)
+        expected = (1 - probability, probability)[shard] / 200
+        np.testing.assert_allclose(batch.probabilities, expected, rtol=1e-3)
 
 
 def test_priorities_reach_the_shard_that_their_keys_name(router: str, session: Session) -> None:
@@ -140,41 +138,41 @@ def test_priorities_reach_the_shard_that_their_keys_name(router: str, session: S
         reply = writer.update(Priorities(keys, np.full(4, 1e6, np.float32)))
         assert reply is not None
         assert (reply.updated, reply.ignored) == (3, 1)
-        told = [s.metrics()["priority_updates"] for s in (first, second)]
-        assert told == [2, 1]
+        updates = [s.metrics().priority_updates for s in (first, second)]
+        assert updates == [2, 1]
         reader = reader_of(session, 2, late_s=_DEADLINE_S)
-        draw(reader, 20 * BATCHES)
-        found = {int(key) for batch in draw(reader, 40 * BATCHES) for key in batch.keys}
+        sample(reader, 20 * BATCHES)
+        found = {int(key) for batch in sample(reader, 40 * BATCHES) for key in batch.keys}
     assert found == {2 * 5, 2 * 6, 2 * 7 + 1}
 
 
-def test_a_shard_that_is_away_is_left_out_until_it_is_back(router: str, session: Session) -> None:
+def test_an_unreachable_shard_is_left_out_until_it_is_back(router: str, session: Session) -> None:
     config = config_of(2)
     with shard_up(config, router, 0):
         fill(session, config, 0, 200, priority=1.0)
         reader = reader_of(session, 2)
         with shard_up(config, router, 1):
             fill(session, config, 1, 200, priority=1.0)
-            assert set(shares(draw(reader, 40 * BATCHES))) == {0, 1}
-        draw(reader, 40 * BATCHES)  # what was under way
+            assert set(frequencies(sample(reader, 40 * BATCHES))) == {0, 1}
+        sample(reader, 40 * BATCHES)  # answers in flight
         before = time.monotonic()
-        assert set(shares(draw(reader, 40 * BATCHES))) == {0}
+        assert set(frequencies(sample(reader, 40 * BATCHES))) == {0}
         assert time.monotonic() - before < _DEADLINE_S
         with shard_up(config, router, 1):
             fill(session, config, 1, 200, priority=1.0)
             deadline = time.monotonic() + _DEADLINE_S
-            while 1 not in shares(draw(reader, BATCHES)):
+            while 1 not in frequencies(sample(reader, BATCHES)):
                 assert time.monotonic() < deadline
 
 
-def test_a_shard_that_holds_back_is_left_out(router: str, session: Session) -> None:
+def test_a_throttled_shard_is_left_out(router: str, session: Session) -> None:
     config = config_of(2)
     with shard_up(config, router, 0), shard_up(config, router, 1):
         fill(session, config, 0, 200, priority=1.0)
-        assert set(shares(draw(reader_of(session, 2), 40 * BATCHES))) == {0}
+        assert set(frequencies(sample(reader_of(session, 2), 40 * BATCHES))) == {0}
 
 
-def test_one_that_waits_for_all_shards_stops_when_told(session: Session) -> None:
+def test_a_reader_waiting_for_all_shards_stops_when_told(session: Session) -> None:
     stop = StopSignal()
     reader = reader_of(session, 3, stop)
     threading.Timer(0.3, stop.set).start()
@@ -187,12 +185,11 @@ ACTORS = {"actor-0": 0, "actor-5": 2, "a12": 0, "7": 1, "host-a-31": 1}
 
 
 @pytest.mark.parametrize("actor", ACTORS)
-def test_an_actors_number_says_where_its_chunks_go(actor: str) -> None:
+def test_an_actors_number_chooses_its_shard(actor: str) -> None:
     assert shard_of(actor, 3) == ACTORS[actor]
     assert shard_of(actor, 1) == 0
 
 
-def test_actors_without_a_number_spread(  # such as containers, named by a checksum
-) -> None:
+def test_actors_without_a_number_spread_over_shards() -> None:
     counts = np.bincount([shard_of(f"{n:x}-x", 4) for n in range(400)], minlength=4)
     assert counts.min() > 60

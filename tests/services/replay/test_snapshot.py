@@ -1,4 +1,4 @@
-"""Priorities and counters outlive the process; no damaged or foreign snapshot does any harm."""
+"""Priorities and counters outlive the process; a damaged or foreign snapshot does no harm."""
 
 import dataclasses
 import logging
@@ -13,142 +13,94 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.errors import CheckpointError
-from mrcdrl.common.messages.trajectory import Chunk, Float64Array
-from mrcdrl.common.messages.wire import encode
-from mrcdrl.services.replay.build import build, open_log
+from mrcdrl.common.messages.trajectory import Float64Array
 from mrcdrl.services.replay.sampler import priorities_of
 from mrcdrl.services.replay.service import ReplayService
 from mrcdrl.services.replay.snapshot import Settings, Snapshot, SnapshotWriter, read_snapshot
-from tests.services.replay.test_recover import Answered, NoServer
-
-LENGTH = 16
-
-
-def settings(**replay: object) -> Config:
-    """A small prioritized table."""
-    small = {"capacity": 500, "min_size": 64, "segment_bytes": 4000, "sampler": "prioritized"}
-    given = {f"replay.{name}": str(value) for name, value in {**small, **replay}.items()}
-    return load_config("smoke", given, environ={})
-
-
-CONFIG = settings()
+from tests.services.replay.harness import (
+    CONFIG,
+    LENGTH,
+    insert,
+    make_chunk,
+    save,
+    settings,
+    start,
+    update,
+)
 
 
-def chunk(sequence: int, *, initial: float | None = None) -> Chunk:
-    rows = CONFIG.arena.stack - 1 + LENGTH + CONFIG.agent.n_step
-    priorities = [] if initial is None else [initial] * LENGTH
-    return Chunk(
-        actor="a",
-        incarnation=1,
-        sequence=sequence,
-        weights_version=0,
-        records=np.zeros((rows, CONFIG.arena.record_bytes), np.uint8),
-        actions=np.zeros(LENGTH, np.uint8),
-        rewards=np.arange(LENGTH, dtype=np.float32) + 100 * sequence,
-        discounts=np.ones(LENGTH, np.float32),
-        bootstrap_offsets=np.ones(LENGTH, np.uint8),
-        priorities=np.array(priorities, np.float32),
-    )
+def scaled_priorities(service: ReplayService) -> Float64Array:
+    return service._table.sampler.scaled_priorities(service._table.keys)
 
 
-def start(directory: Path, config: Config = CONFIG) -> ReplayService:
-    table, limiter = build(config)
-    log = open_log(config, directory)
-    service = ReplayService(config, table, limiter, *[NoServer()] * 3, log)
-    service.recover()
-    return service
-
-
-def insert(service: ReplayService, *chunks: Chunk) -> None:
-    for each in chunks:
-        request = Answered(encode(each))
-        service._insert(request)
-        service._commit()
-        assert request.answers == ["reply"]
-
-
-def update(service: ReplayService, priorities: dict[int, float]) -> None:
-    keys, values = np.array(list(priorities)), np.array(list(priorities.values()), np.float32)
-    service._table.update_priorities(keys, values)
-
-
-def save(service: ReplayService, directory: Path) -> None:
-    (directory / "snapshot").write_bytes(service.snapshot().to_bytes())
-
-
-def shares(service: ReplayService) -> Float64Array:
-    return service._table.sampler.shares(service._table.keys)
-
-
-def share(priority: float) -> float:
+def scaled(priority: float) -> float:
     exact = float(np.float32(priority))
     return float((exact + 1e-6) ** CONFIG.replay.priority_exponent)
 
 
-def test_priorities_are_there_again(tmp_path: Path) -> None:
+def test_priorities_survive_a_restart(tmp_path: Path) -> None:
     first = start(tmp_path)
-    insert(first, *map(chunk, range(5)))
+    insert(first, *map(make_chunk, range(5)))
     rng = np.random.default_rng(0)
     update(first, dict(enumerate(rng.lognormal(0, 4, 5 * LENGTH).tolist())))
     update(first, {3: 0.0, 4: 1e-9})
     save(first, tmp_path)
     again = start(tmp_path)  # the first was never closed: a kill -9
-    np.testing.assert_allclose(shares(again), shares(first), rtol=1e-9)
+    np.testing.assert_allclose(scaled_priorities(again), scaled_priorities(first), rtol=1e-9)
     again._table.check_invariants()
     assert again._table.sampler.largest == first._table.sampler.largest
 
 
-def test_newer_transitions_keep_their_initial_priorities_and_gone_ones_are_passed_over(
+def test_newer_transitions_keep_their_initial_priorities_and_evicted_ones_are_skipped(
     tmp_path: Path,
 ) -> None:
     first = start(tmp_path)
     first._limiter.samples_per_insert = 0
-    insert(first, *map(chunk, range(10)))
+    insert(first, *map(make_chunk, range(10)))
     update(first, dict.fromkeys(range(10 * LENGTH), 0.5))
     save(first, tmp_path)
-    insert(first, *(chunk(n, initial=7.0) for n in range(10, 33)))
+    insert(first, *(make_chunk(n, priority=7.0) for n in range(10, 33)))
     again = start(tmp_path)
     kept = 10 * LENGTH - again._table.first_key
     assert 0 < kept < 10 * LENGTH
-    np.testing.assert_allclose(shares(again)[:kept], share(0.5), rtol=1e-9)
-    np.testing.assert_allclose(shares(again)[kept:], share(7.0), rtol=1e-9)
+    np.testing.assert_allclose(scaled_priorities(again)[:kept], scaled(0.5), rtol=1e-9)
+    np.testing.assert_allclose(scaled_priorities(again)[kept:], scaled(7.0), rtol=1e-9)
 
 
 def test_the_largest_priority_outlives_the_transition_that_had_it(tmp_path: Path) -> None:
     first = start(tmp_path)
-    insert(first, chunk(0, initial=1.0))
+    insert(first, make_chunk(0, priority=1.0))
     update(first, {0: 50.0})
     update(first, {0: 2.0})
     save(first, tmp_path)
     again = start(tmp_path)
-    insert(again, chunk(1))
-    np.testing.assert_allclose(shares(again)[LENGTH:], share(50.0), rtol=1e-9)
+    insert(again, make_chunk(1))
+    np.testing.assert_allclose(scaled_priorities(again)[LENGTH:], scaled(50.0), rtol=1e-9)
 
 
-def test_counters_go_on_where_they_were(tmp_path: Path) -> None:
+def test_counters_continue_where_they_were(tmp_path: Path) -> None:
     first = start(tmp_path)
-    insert(first, *map(chunk, range(5)))
+    insert(first, *map(make_chunk, range(5)))
     first._limiter.samples = 96
     save(first, tmp_path)
-    insert(first, chunk(5))
+    insert(first, make_chunk(5))
     again = start(tmp_path)
     assert (again._limiter.inserts, again._limiter.samples) == (96, 96)
-    assert again.metrics()["inserts"] == 96
-    assert again.metrics()["samples"] == 96
+    assert again.metrics().inserts == 96
+    assert again.metrics().samples == 96
     save(again, tmp_path)
-    assert start(tmp_path).metrics()["samples"] == 96
+    assert start(tmp_path).metrics().samples == 96
 
 
 def test_samples_forgotten_since_the_snapshot_leave_the_lead_within_the_buffer(
     tmp_path: Path,
 ) -> None:
     first = start(tmp_path)
-    insert(first, *map(chunk, range(5)))
+    insert(first, *map(make_chunk, range(5)))
     save(first, tmp_path)
     first._limiter.samples_per_insert = 0
-    insert(first, *map(chunk, range(5, 25)))
+    insert(first, *map(make_chunk, range(5, 25)))
     limiter = start(tmp_path)._limiter
     due = (limiter.inserts - limiter.min_size) * limiter.samples_per_insert
     assert 0 < due - limiter.samples <= limiter.error_buffer
@@ -158,7 +110,7 @@ def test_a_table_that_lost_its_log_fills_anew(tmp_path: Path) -> None:
     config = settings(min_size=100)
     first = start(tmp_path, config)
     first._limiter.samples_per_insert = 0
-    insert(first, *map(chunk, range(20)))
+    insert(first, *map(make_chunk, range(20)))
     save(first, tmp_path)
     paths = sorted(tmp_path.glob("*.segment"))
     for path in paths[1:]:
@@ -169,24 +121,24 @@ def test_a_table_that_lost_its_log_fills_anew(tmp_path: Path) -> None:
     assert again._limiter.inserts == len(again._table)
 
 
-def test_the_configuration_beats_the_snapshot_and_the_difference_is_logged(
+def test_the_configuration_overrides_the_snapshot_and_the_difference_is_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = start(tmp_path)
-    insert(first, *map(chunk, range(5)))
+    insert(first, *map(make_chunk, range(5)))
     update(first, dict.fromkeys(range(5 * LENGTH), 0.5))
     save(first, tmp_path)
     changed = settings(priority_exponent=0.9, min_size=70, samples_per_insert=0.5, capacity=400)
     with caplog.at_level(logging.INFO):
         again = start(tmp_path, changed)
-    (line,) = [r.getMessage() for r in caplog.records if "beats" in r.getMessage()]
+    (line,) = [r.getMessage() for r in caplog.records if "overrides" in r.getMessage()]
     assert line == (
-        "the configuration beats the snapshot: replay.capacity is 400, was 500; "
+        "the configuration overrides the snapshot: replay.capacity is 400, was 500; "
         f"replay.samples_per_insert is 0.5, was {CONFIG.replay.samples_per_insert}; "
         "replay.min_size is 70, was 64; "
         f"replay.priority_exponent is 0.9, was {CONFIG.replay.priority_exponent}"
     )
-    np.testing.assert_allclose(shares(again), (0.5 + 1e-6) ** 0.9, rtol=1e-6)
+    np.testing.assert_allclose(scaled_priorities(again), (0.5 + 1e-6) ** 0.9, rtol=1e-6)
     assert again._limiter.samples_per_insert == 0.5
     assert again._table.capacity == 400
 
@@ -203,18 +155,18 @@ def test_a_snapshot_without_usable_priorities_leaves_the_initial_ones(
     tmp_path: Path, was: dict[str, object], now: dict[str, object]
 ) -> None:
     first = start(tmp_path, settings(**was))
-    insert(first, *(chunk(n, initial=3.0) for n in range(5)))
+    insert(first, *(make_chunk(n, priority=3.0) for n in range(5)))
     first._limiter.samples = 32
     save(first, tmp_path)
     again = start(tmp_path, settings(**now))
-    assert np.allclose(shares(again), share(3.0), rtol=1e-9)
+    assert np.allclose(scaled_priorities(again), scaled(3.0), rtol=1e-9)
     assert again._limiter.samples == 32
 
 
-def test_without_damage_nothing_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_damage_nothing_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first = start(tmp_path)
     save(first, tmp_path)
-    insert(first, chunk(0))
+    insert(first, make_chunk(0))
     with caplog.at_level(logging.INFO):
         start(tmp_path)
         save(first, tmp_path)
@@ -234,14 +186,17 @@ def beyond(data: bytes) -> bytes:
 
 
 BAD: dict[str, tuple[Callable[[bytes], bytes], str]] = {
-    "empty": (lambda data: b"", "is no snapshot"),
-    "foreign file": (lambda data: b"\x89PNG\r\n" + data, "is no snapshot"),
-    "another version": (lambda data: data.replace(b"snapshot 1", b"snapshot 2"), "is no snapshot"),
+    "empty": (lambda data: b"", "is not a snapshot"),
+    "foreign file": (lambda data: b"\x89PNG\r\n" + data, "is not a snapshot"),
+    "another version": (
+        lambda data: data.replace(b"snapshot 1", b"snapshot 2"),
+        "is not a snapshot",
+    ),
     "header only": (lambda data: data[:27], "is torn"),
     "torn": (lambda data: data[:-1], "is torn or damaged"),
     "longer": (lambda data: data + b"\0", "is torn or damaged"),
-    "another run's": (foreign, "not about the log's transitions"),
-    "of another log": (beyond, "not about the log's transitions"),
+    "another run's": (foreign, "does not match the log's transitions"),
+    "of another log": (beyond, "does not match the log's transitions"),
 }
 
 
@@ -251,29 +206,29 @@ def test_a_bad_snapshot_is_reported_and_ignored(
 ) -> None:
     spoil, said = BAD[name]
     first = start(tmp_path)
-    insert(first, *(chunk(n, initial=3.0) for n in range(5)))
+    insert(first, *(make_chunk(n, priority=3.0) for n in range(5)))
     update(first, dict.fromkeys(range(5 * LENGTH), 0.5))
     first._limiter.samples = 7
     (tmp_path / "snapshot").write_bytes(spoil(first.snapshot().to_bytes()))
     again = start(tmp_path)
     (warning,) = [r.getMessage() for r in caplog.records]
     assert said in warning
-    assert "ignored" in warning
-    np.testing.assert_allclose(shares(again), share(3.0), rtol=1e-9)
+    assert "ignoring" in warning
+    np.testing.assert_allclose(scaled_priorities(again), scaled(3.0), rtol=1e-9)
     assert again._limiter.inserts == 5 * LENGTH
     assert again._limiter.samples != 7
 
 
 def example() -> Snapshot:
     return Snapshot(
-        settings=Settings.of(CONFIG),
+        settings=Settings.from_config(CONFIG),
         first_key=7,
         inserts=100,
         samples=64,
         all_samples=640,
         largest=3.5,
         rng_state=np.random.default_rng(3).bit_generator.state,
-        shares=np.array([0.5, 2.0, 0.25]),
+        scaled_priorities=np.array([0.5, 2.0, 0.25]),
         rewards=np.array([1, -5, 200], np.float32),
     )
 
@@ -294,7 +249,7 @@ def test_every_flipped_bit_is_noticed(bit: int) -> None:
 
 
 @given(st.lists(st.floats(0, 1e6, width=32), min_size=1), st.floats(0.05, 1))
-def test_priorities_come_back_from_their_shares(errors: list[float], exponent: float) -> None:
+def test_priorities_come_back_from_scaled_priorities(errors: list[float], exponent: float) -> None:
     exact = np.array(errors, np.float32).astype(np.float64)
     made = (exact + 1e-6) ** exponent
     again = (priorities_of(made, exponent).astype(np.float64) + 1e-6) ** exponent
@@ -310,7 +265,7 @@ def test_the_service_writes_one_when_it_stops_and_leaves_no_part_of_another(
     service.start()
     try:
         assert service.healthy
-        insert(service, *map(chunk, range(5)))
+        insert(service, *map(make_chunk, range(5)))
         update(service, {0: 9.0})
     finally:
         service.stop()
@@ -338,26 +293,26 @@ def test_one_is_written_every_period(tmp_path: Path) -> None:
     assert read_snapshot(tmp_path) is not None
 
 
-def test_a_snapshot_that_cannot_be_written_is_said_once(
+def test_a_snapshot_that_cannot_be_written_is_logged_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     writer = SnapshotWriter(tmp_path / "missing", example, period_s=3600)
     writer._write()
     writer._write()
     (warning,) = [r.getMessage() for r in caplog.records]
-    assert warning == "no snapshot of the priorities was written: No such file or directory"
+    assert warning == "cannot write a snapshot of the priorities: No such file or directory"
 
 
-def test_the_draws_go_on_and_do_not_begin_anew(tmp_path: Path) -> None:
+def test_the_random_stream_continues_after_a_restart(tmp_path: Path) -> None:
     first = start(tmp_path)
-    insert(first, *map(chunk, range(5)))
+    insert(first, *map(make_chunk, range(5)))
     first._table.sample(32)
     save(first, tmp_path)
     again = start(tmp_path)
     np.testing.assert_array_equal(again._table.sample(32).keys, first._table.sample(32).keys)
 
 
-def test_a_snapshot_from_before_the_draws_were_in_it_is_read() -> None:
+def test_a_snapshot_without_a_random_state_is_read() -> None:
     without = (
         dataclasses.replace(example(), rng_state={}).to_bytes().replace(b'"rng_state": {}, ', b"")
     )

@@ -1,4 +1,4 @@
-"""A replay service that is killed and started again, against a plain list of priorities."""
+"""A replay service that is killed and restarted, against a plain list of priorities."""
 
 import shutil
 import tempfile
@@ -9,7 +9,7 @@ from hypothesis import settings as profile
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from tests.services.replay.test_snapshot import LENGTH, chunk, insert, save, settings, start, update
+from tests.services.replay.harness import LENGTH, insert, make_chunk, save, settings, start, update
 
 CONFIG = settings(capacity=200, min_size=32, samples_per_insert=0, segment_bytes=9000)
 EXPONENT = CONFIG.replay.priority_exponent
@@ -17,9 +17,9 @@ PRIORITIES = st.floats(0, 1000, width=32)
 
 
 class Lives(RuleBasedStateMachine):
-    """Of every transition ever inserted its initial and present priority, and that of a snapshot.
+    """Keeps the initial, present and last saved priority of every transition ever inserted.
 
-    Samples and inserts are counted beside it.
+    Also counts samples and inserts.
     """
 
     @initialize()
@@ -34,7 +34,7 @@ class Lives(RuleBasedStateMachine):
     @rule(priorities=st.lists(PRIORITIES, min_size=1, max_size=5))
     def insert(self, priorities: list[float]) -> None:
         for priority in priorities:
-            insert(self.service, chunk(len(self.initial) // LENGTH, initial=priority))
+            insert(self.service, make_chunk(len(self.initial) // LENGTH, priority=priority))
             self.initial += [priority] * LENGTH
             self.present += [priority] * LENGTH
 
@@ -60,7 +60,7 @@ class Lives(RuleBasedStateMachine):
         self.present = self.saved + self.initial[len(self.saved) :]
         known = set(self.service._table.keys) & set(range(len(self.saved)))
         self.samples = self.saved_samples if known else 0
-        if not known:  # all that the snapshot knew of was replaced since
+        if not known:  # everything in the snapshot has been evicted since
             self.present = self.initial.copy()
         self.saved, self.saved_samples = self.present.copy(), self.samples
         save(self.service, self.directory)
@@ -71,9 +71,9 @@ class Lives(RuleBasedStateMachine):
         table.check_invariants()
         assert table.keys.stop == len(self.initial)
         expected = (np.array(self.present[table.keys.start :]) + 1e-6) ** EXPONENT
-        np.testing.assert_allclose(table.sampler.shares(table.keys), expected, rtol=1e-6)
+        np.testing.assert_allclose(table.sampler.scaled_priorities(table.keys), expected, rtol=1e-6)
         metrics = self.service.metrics()
-        assert (metrics["inserts"], metrics["samples"]) == (len(self.initial), self.samples)
+        assert (metrics.inserts, metrics.samples) == (len(self.initial), self.samples)
 
     def teardown(self) -> None:
         if hasattr(self, "directory"):

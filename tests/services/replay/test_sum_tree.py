@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from mrcdrl.services.replay.sum_tree import SumTree
 
-# From what rounds to nothing beside the others to what swallows them.
+# From values lost to rounding beside the others to values that swallow them.
 VALUES = st.one_of(st.just(0.0), st.floats(1e-12, 1e12), st.floats(0.0, 1.0, width=16))
 BELOW_ONE = st.floats(0.0, 1.0, exclude_max=True)
 
@@ -25,7 +25,7 @@ def tree_of(values: list[float], num_roots: int = 2) -> SumTree:
 
 
 class TreeAgainstList(RuleBasedStateMachine):
-    """Values by index; sums and draws follow from them."""
+    """Values by index determine sums and samples."""
 
     @initialize(size=st.integers(1, 70), num_roots=ROOTS)
     def make(self, size: int, num_roots: int) -> None:
@@ -53,10 +53,10 @@ class TreeAgainstList(RuleBasedStateMachine):
             with pytest.raises(ValueError, match="all values are 0"):
                 self.tree.sample(np.array(uniforms))
             return
-        drawn = self.tree.sample(np.array(uniforms)).tolist()
+        sampled = self.tree.sample(np.array(uniforms)).tolist()
         bounds = np.concatenate([[0.0], np.cumsum(self.model)])
         near = 1e-9 * bounds[-1]
-        for row, (index, uniform) in enumerate(zip(drawn, uniforms, strict=True)):
+        for row, (index, uniform) in enumerate(zip(sampled, uniforms, strict=True)):
             assert self.model[index] > 0
             target = (row + uniform) / len(uniforms) * bounds[-1]
             assert bounds[index] - near <= target <= bounds[index + 1] + near
@@ -72,7 +72,7 @@ TestTreeAgainstList = TreeAgainstList.TestCase
 TestTreeAgainstList.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
 
 
-def test_draws_by_hand() -> None:
+def test_samples_by_hand() -> None:
     """Values 1, 0, 3, 4 fill 0-1, 1-1, 1-4, 4-8."""
     tree = tree_of([1.0, 0.0, 3.0, 4.0])
     assert tree.total == 8.0
@@ -89,16 +89,16 @@ def test_draws_by_hand() -> None:
 @example([1e12, 0.0, 1e-12, 0.0], 3, 2)
 @example([1e12, 0.0, 1e-12, 0.0], 3, 4096)
 @example([5e-324], 2, 1)
-def test_the_greatest_uniform_draws_no_zero(
+def test_the_greatest_uniform_samples_no_zero(
     values: list[float], count: int, num_roots: int
 ) -> None:
     tree = tree_of(values, num_roots)
-    drawn = tree.sample(np.full(count, np.nextafter(1.0, 0.0)))
-    assert (tree.get(drawn) > 0).all()
+    sampled = tree.sample(np.full(count, np.nextafter(1.0, 0.0)))
+    assert (tree.get(sampled) > 0).all()
 
 
 def test_sums_do_not_drift() -> None:
-    """After large values have come and gone 2 000 times, the total is that of a new tree."""
+    """After 2 000 rounds of large values, the total is that of a new tree."""
     tree, rng = SumTree(100), np.random.default_rng(0)
     for _ in range(2000):
         indices = rng.integers(0, 100, 64)
@@ -117,7 +117,7 @@ def test_sums_do_not_drift() -> None:
         ([0], [math.inf], "negative or not finite"),
     ],
 )
-def test_what_is_no_value_or_index_is_refused_and_changes_nothing(
+def test_an_impossible_value_or_index_is_refused_and_changes_nothing(
     indices: list[int], values: list[float], reason: str
 ) -> None:
     tree = tree_of([1.0, 2.0, 3.0, 4.0])
@@ -135,7 +135,7 @@ def test_what_is_no_value_or_index_is_refused_and_changes_nothing(
         (2, [-1.0], "negative or not finite"),
     ],
 )
-def test_what_cannot_be_filled_is_refused_and_changes_nothing(
+def test_an_impossible_fill_is_refused_and_changes_nothing(
     start: int, values: list[float], reason: str
 ) -> None:
     tree = tree_of([1.0, 2.0, 3.0, 4.0])

@@ -1,6 +1,6 @@
 """The table against a plain list of transitions: same data, same keys, oldest out first.
 
-With both samplers; how prioritized draws are spread and weighed is in test_sampler.py.
+Uses both samplers; test_sampler.py tests how prioritized samples are spread and weighted.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ def make_chunk(
     n_step: int = 1,
     priorities: Sequence[float] = (),
 ) -> Chunk:
-    """Chunk `number`, its records and columns unlike those of any other of 65536."""
+    """Chunk `number`; its records and columns differ from those of 65535 others."""
     rows = np.arange(stack - 1 + length + n_step, dtype=np.uint16)
     marks = np.stack([np.full_like(rows, number), rows], axis=1)
     steps = np.arange(length)
@@ -67,7 +67,7 @@ def make_table(
 
 @dataclass(frozen=True)
 class Transition:
-    """What the model keeps of one transition."""
+    """A transition in the model."""
 
     records: UInt8Array
     action: int
@@ -81,7 +81,7 @@ PRIORITIES = st.floats(0, 1000, width=32)
 
 
 class TableAgainstList(RuleBasedStateMachine):
-    """Every transition ever inserted stands in a list, at its key, and so does its priority."""
+    """Lists every transition ever inserted, and its priority, by key."""
 
     @initialize(
         capacity=st.integers(1, 40),
@@ -109,9 +109,11 @@ class TableAgainstList(RuleBasedStateMachine):
                 len(self.lengths), length, stack=self.stack, n_step=self.n_step, priorities=given
             )
             if self.model and data.draw(st.booleans()):
-                back = data.draw(st.integers(1, min(4, len(self.lengths))))  # robots take turns
+                back = data.draw(
+                    st.integers(1, min(4, len(self.lengths)))
+                )  # robots' chunks alternate
                 last = len(self.model) - 1 - sum(self.lengths[len(self.lengths) - back + 1 :])
-                chunk = going_on(chunk, self.model[last].records)
+                chunk = continuing(chunk, self.model[last].records)
             self.table.insert(chunk)
             self.priorities += given or [self.largest] * length
             self.largest = max(self.largest, *given, 0.0)
@@ -133,13 +135,13 @@ class TableAgainstList(RuleBasedStateMachine):
         keys = data.draw(st.lists(st.integers(-3, len(self.model) + 3), max_size=12))
         given = data.draw(st.lists(PRIORITIES, min_size=len(keys), max_size=len(keys)))
         taken = self.table.update_priorities(np.array(keys, np.int64), np.array(given, np.float32))
-        there = [
+        present = [
             (key, priority)
             for key, priority in zip(keys, given, strict=True)
             if self.oldest <= key < len(self.model)
         ]
-        assert taken == (len(there) if self.prioritized else 0)
-        for key, priority in there:
+        assert taken == (len(present) if self.prioritized else 0)
+        for key, priority in present:
             self.priorities[key] = priority
             self.largest = max(self.largest, priority)
 
@@ -165,22 +167,22 @@ class TableAgainstList(RuleBasedStateMachine):
         return len(self.model) - len(self.table)
 
     def probabilities(self, keys: Int64Array) -> Float64Array:
-        """Of these keys, by definition."""
+        """Probabilities of these keys, by definition."""
         if not self.prioritized:
             return np.full(len(keys), 1 / len(self.table))
-        shares = (np.array(self.priorities) + 1e-6) ** EXPONENT
-        shares[: self.oldest] = 0
-        return shares[keys] / shares.sum()
+        scaled = (np.array(self.priorities) + 1e-6) ** EXPONENT
+        scaled[: self.oldest] = 0
+        return scaled[keys] / scaled.sum()
 
     @invariant()
     def holds_the_newest_whole_chunks(self) -> None:
         self.table.check_invariants()
-        held = len(self.table)
-        assert held <= self.capacity
+        size = len(self.table)
+        assert size <= self.capacity
         newest_first = np.cumsum(self.lengths[::-1]).tolist()
-        assert held in (0, *newest_first)
+        assert size in (0, *newest_first)
         if newest_first:
-            assert held >= newest_first[0]
+            assert size >= newest_first[0]
 
 
 TestTableAgainstList = TableAgainstList.TestCase
@@ -196,20 +198,20 @@ def test_full_chunks_fill_the_whole_capacity_and_leave_in_order() -> None:
     assert (keys.min(), keys.max()) == (65 * 50 - 1000, 65 * 50 - 1)
 
 
-def test_each_transition_is_drawn_as_often_as_any_other() -> None:
+def test_each_transition_is_sampled_as_often_as_any_other() -> None:
     table = make_table(200, seed=5)
     for number in range(5):
         table.insert(make_chunk(number, 50))
-    draws, held = 200_000, 200
-    counts = np.bincount(table.sample(draws).keys - 50)
-    assert len(counts) == held
-    expected = draws / held
+    num_samples, size = 200_000, 200
+    counts = np.bincount(table.sample(num_samples).keys - 50)
+    assert len(counts) == size
+    expected = num_samples / size
     chi_square = float(((counts - expected) ** 2 / expected).sum())
     assert chi_square < 266.4  # 99.9 % of chi-square with 199 degrees of freedom
 
 
 @pytest.mark.parametrize("prioritized", [False, True])
-def test_the_same_seed_draws_the_same(prioritized: bool) -> None:
+def test_the_same_seed_gives_the_same_samples(prioritized: bool) -> None:
     tables = [make_table(20, seed=3, prioritized=prioritized) for _ in range(2)]
     for table in tables:
         table.insert(make_chunk(0, 20))
@@ -240,8 +242,8 @@ def test_a_chunk_of_other_settings_is_refused(chunk: Callable[[], Chunk], reason
     table.check_invariants()
 
 
-def going_on(chunk: Chunk, before: UInt8Array) -> Chunk:
-    """The chunk with the records that a window [W, R] before it ends with as its first."""
+def continuing(chunk: Chunk, before: UInt8Array) -> Chunk:
+    """The chunk, beginning with the records that end an earlier window [W, R]."""
     overlap = len(before) - 1
     records = np.concatenate([before[-overlap:], chunk.records[overlap:]])
     return dataclasses.replace(chunk, records=records)
@@ -262,8 +264,8 @@ def test_one_robots_consecutive_chunks_share_their_records() -> None:
     np.testing.assert_array_equal(samples.records, expected)
 
 
-def robots_in_turns(table: Table, num_robots: int, num_chunks: int, *, follow: bool) -> None:
-    """Insert full chunks, of which each goes on with its robot's one before, or none does."""
+def alternate_robots(table: Table, num_robots: int, num_chunks: int, *, follow: bool) -> None:
+    """Insert full chunks of which each continues its robot's last one, or none does."""
     robots = [np.arange(4 + 8 * num_chunks, dtype=np.uint16) for _ in range(num_robots)]
     streams = [np.stack([np.full_like(r, i), r], 1).view(np.uint8) for i, r in enumerate(robots)]
     for number in range(num_chunks):
@@ -273,12 +275,12 @@ def robots_in_turns(table: Table, num_robots: int, num_chunks: int, *, follow: b
         table.check_invariants()
 
 
-def test_many_robots_chunks_in_turns_share_their_records() -> None:
+def test_alternating_chunks_of_many_robots_share_their_records() -> None:
     sharing, apart = make_table(800), make_table(800)
-    robots_in_turns(sharing, 10, 400, follow=True)
-    robots_in_turns(apart, 10, 400, follow=False)
+    alternate_robots(sharing, 10, 400, follow=True)
+    alternate_robots(apart, 10, 400, follow=False)
     assert len(sharing) == 800
-    assert 0.9 * 800 < len(apart) < 800  # tails past those that have a place take the ring's rows
+    assert 0.9 * 800 < len(apart) < 800  # surplus tails take rows of the ring
     samples = sharing.sample(400)
     robot, row = samples.records.view(np.uint16)[..., 0], samples.records.view(np.uint16)[..., 1]
     number, step = samples.keys // 8, samples.keys % 8
@@ -287,7 +289,7 @@ def test_many_robots_chunks_in_turns_share_their_records() -> None:
     np.testing.assert_array_equal(row, first[:, None] + np.arange(5))
 
 
-def test_records_are_gathered_into_memory_of_the_caller() -> None:
+def test_records_are_gathered_into_the_callers_memory() -> None:
     table = make_table(100)
     table.insert(make_chunk(1, 10))
     memory = bytearray(table.sample_bytes(6))

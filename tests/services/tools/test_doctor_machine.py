@@ -113,9 +113,9 @@ def test_memory(tmp_path: Path) -> None:
 
 
 def test_the_table_is_as_large_as_is_said() -> None:
-    from mrcdrl.services.replay.build import build
+    from mrcdrl.services.replay.table import Table
 
-    table, _ = build(SMOKE)
+    table = Table.from_config(SMOKE)
     assert table_bytes(SMOKE) == pytest.approx(table.nbytes, rel=0.1)
 
 

@@ -1,0 +1,73 @@
+"""The command line of `mrcdrl replay`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from mrcdrl.common.config import Config, TransportConfig, load_config
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.runtime.files import RUN_CONFIG
+from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.sync.joining import recorded_endpoint
+from mrcdrl.common.transport.keys import Keys
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """What a replay process needs to serve its run."""
+
+    run: str
+    worker: str
+    shard: int
+    run_dir: Path  # of this run
+    config: Config
+    transport: TransportConfig
+
+    @classmethod
+    def from_argv(cls, argv: Sequence[str]) -> Self:
+        """Parse the command line.
+
+        Raises EndpointError if the flags, the configuration and the run directory name no endpoint.
+        """
+        parser = Parser(prog="mrcdrl replay", description="Serve the replay table of a run.")
+        parser.add_argument("--run", required=True, help="the run's name")
+        parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
+        parser.add_argument("--listen", action="append", help="endpoint, as tcp/127.0.0.1:7447")
+        parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
+        parser.add_argument(
+            "--shard", type=int, default=0, help="number among replay.shards, from 0"
+        )
+        parser.add_argument("--id", help="this worker's name; default: from the shard")
+        parser.add_argument(
+            "--run-dir", type=Path, default=Path("runs"), help="where runs are kept"
+        )
+        add_config_flags(parser)
+        arguments = parser.parse_args(argv)
+        run_dir = arguments.run_dir / check_name(arguments.run, "run name")
+        config = load_config(arguments.config or _config_of(run_dir), overrides(arguments))
+        listen, connect = tuple(arguments.listen or ()), tuple(arguments.connect or ())
+        if not (listen or connect):
+            listen, connect = config.transport.listen, config.transport.connect
+        if not (listen or connect):
+            listen = (recorded_endpoint(run_dir, "--listen"),)
+        transport = config.transport.model_copy(update={"listen": listen, "connect": connect})
+        shard = arguments.shard
+        if not 0 <= shard < config.replay.shards:
+            parser.error(f"--shard {shard}: the run has {config.replay.shards} (replay.shards)")
+        worker = check_name(arguments.id or f"replay-{shard}", "--id")
+        return cls(arguments.run, worker, shard, run_dir, config, transport)
+
+    @property
+    def keys(self) -> Keys:
+        return Keys(self.run)
+
+    @property
+    def log_directory(self) -> Path:
+        return self.run_dir / "replay" / str(self.shard)
+
+
+def _config_of(run_dir: Path) -> str | None:
+    """The configuration file of the run directory, if it has one."""
+    path = run_dir / RUN_CONFIG
+    return str(path) if path.is_file() else None
