@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mrcdrl.services.monitor.summary import machine, versions
+from mrcdrl.common.runtime.versions import all_versions
+from mrcdrl.services.monitor.summary import machine
 
 
 def seconds_per_call(work: Callable[[], object], *, seconds: float, repeats: int) -> list[float]:
@@ -40,7 +41,7 @@ def emit(result: dict[str, Any]) -> None:
         **result,
         "machine": machine(),
         "cores": sorted(os.sched_getaffinity(0)),
-        "versions": versions(),
+        "versions": all_versions(),
         "command": " ".join(["python -m", f"benchmarks.{Path(sys.argv[0]).stem}", *sys.argv[1:]]),
     }
     print(json.dumps(line), flush=True)

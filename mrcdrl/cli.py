@@ -1,4 +1,4 @@
-"""`mrcdrl …`: every command under one name; each is imported only when it is called."""
+"""`mrcdrl …`: every command under one name, each imported only when it is called."""
 
 import importlib
 import sys
@@ -7,28 +7,28 @@ from mrcdrl.common.runtime.process import run_main
 
 _COMMANDS = {
     "train": ("mrcdrl.services.train.main", "train on this machine: all processes, one command"),
-    "evaluate": ("mrcdrl.services.tools.evaluate", "the paper's test for weights or a controller"),
-    "render": ("mrcdrl.services.tools.render", "a film of evaluation episodes"),
-    "report": ("mrcdrl.services.tools.report", "the images and the film of a run"),
-    "figure": ("mrcdrl.services.tools.figure", "the paper's images of runs and controllers"),
-    "export": ("mrcdrl.services.tools.export", "weights as ONNX, torch.export or TorchScript"),
+    "evaluate": (
+        "mrcdrl.services.tools.evaluate",
+        "run the paper's test on weights or a controller",
+    ),
+    "render": ("mrcdrl.services.tools.render", "film evaluation episodes"),
+    "report": ("mrcdrl.services.tools.report", "plot a run and film its best weights"),
+    "figure": ("mrcdrl.services.tools.figure", "plot the paper's figures for runs and controllers"),
+    "export": ("mrcdrl.services.tools.export", "export weights: ONNX, torch.export or TorchScript"),
     "config": ("mrcdrl.services.tools.config", "print the resolved configuration"),
     "replay": ("mrcdrl.services.replay.main", "serve the replay table of a run"),
-    "replay inspect": ("mrcdrl.services.replay.inspect.main", "what the replay log of a run holds"),
-    "status": ("mrcdrl.services.status.main", "what a run that is up does, and what limits it"),
+    "replay inspect": ("mrcdrl.services.replay.inspect.main", "show what a run's replay log holds"),
+    "status": ("mrcdrl.services.status.main", "show what a live run does, and its bottleneck"),
     "doctor": (
         "mrcdrl.services.tools.doctor.main",
-        "what this machine and a run lack, and how to mend it",
+        "check this machine and a run, and say how to fix what is wrong",
     ),
     "router": ("mrcdrl.services.router.main", "relay between the processes of runs"),
-    "certs": ("mrcdrl.services.tools.certs", "certificates for trials, one for each role"),
-    "actor": ("mrcdrl.services.actor.main", "collect for a run that is up"),
-    "simulate": ("mrcdrl.services.tools.simulate.main", "the load of many actors on replay"),
-    "learner": ("mrcdrl.services.learner.main", "learn for a run that is up"),
-    "evaluator": (
-        "mrcdrl.services.evaluator.main",
-        "judge the live weights of a run that is up",
-    ),
+    "certs": ("mrcdrl.services.tools.certs", "make certificates for trials, one for each role"),
+    "actor": ("mrcdrl.services.actor.main", "collect for a live run"),
+    "simulate": ("mrcdrl.services.tools.simulate.main", "put the load of many actors on replay"),
+    "learner": ("mrcdrl.services.learner.main", "learn for a live run"),
+    "evaluator": ("mrcdrl.services.evaluator.main", "evaluate the live weights of a live run"),
 }
 
 
@@ -41,7 +41,7 @@ def main() -> int:
     words = 2 if " ".join(arguments[:2]) in _COMMANDS else 1
     name = " ".join(arguments[:words])
     if name not in _COMMANDS:
-        sys.stderr.write(f"mrcdrl: no command {name!r}; there are {', '.join(_COMMANDS)}\n")
+        sys.stderr.write(f"mrcdrl: no command {name!r}; the commands are {', '.join(_COMMANDS)}\n")
         return 2
     command = importlib.import_module(_COMMANDS[name][0])
     return run_main(lambda: command.main(arguments[words:]))

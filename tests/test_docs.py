@@ -13,14 +13,14 @@ from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any, get_args, get_origin, get_type_hints
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 from mrcdrl import cli
 from mrcdrl.common.arena.controllers import CONTROLLERS
-from mrcdrl.common.config import Config, TransportConfig, load_config, preset_names
+from mrcdrl.common.config import Config, TransportConfig, preset_names
+from mrcdrl.common.messages.metrics import SCHEMAS, kinds
 from mrcdrl.common.messages.trajectory import (
     Chunk,
     EpisodeSummary,
@@ -42,19 +42,13 @@ from mrcdrl.common.model.weights_io import weights_to_bytes
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.evaluator.navigation import Navigation, RobotNavigation
-from mrcdrl.services.learner.diagnostics import Diagnostics
-from mrcdrl.services.learner.learner import Learner
-from mrcdrl.services.learner.timing import StageTimer
 from mrcdrl.services.monitor.recorder import EVALUATION_FIELDS, RATES, flat_metrics
 from mrcdrl.services.monitor.records import EpisodeRecord, EvaluationRecord
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.summary import summary
-from mrcdrl.services.replay.build import build
 from mrcdrl.services.replay.inspect.contents import Contents
 from mrcdrl.services.replay.inspect.export import arrays
-from mrcdrl.services.replay.inspect.summary import digest
-from mrcdrl.services.replay.service import ReplayService
-from tests.services.learner.test_learner import random_batch
+from mrcdrl.services.replay.inspect.summary import summarize
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -238,64 +232,10 @@ def test_example_subscriber_runs(tmp_path: Path) -> None:
 
 # -- metrics -----------------------------------------------------------------------------
 
-METRICS_OF = {
-    "services/actor/actor.py": "actor",
-    "services/replay/service.py": "replay",
-    "services/learner/timing.py": "learner",
-    "services/evaluator/evaluator.py": "evaluator",
-}
 
-
-def functions_that_tell(path: Path) -> list[ast.FunctionDef]:
-    tree = ast.parse(path.read_text("utf-8"))
-    return [
-        node
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef) and node.name in ("metrics", "_metrics")
-    ]
-
-
-def literal_keys(path: str) -> set[str]:
-    """Constant keys of the dictionaries that a service's metrics are made of."""
-    return {
-        key.value
-        for function in functions_that_tell(ROOT / path)
-        for node in ast.walk(function)
-        if isinstance(node, ast.Dict)
-        for key in node.keys
-        if isinstance(key, ast.Constant) and isinstance(key.value, str)
-    }
-
-
-def published(role: str) -> set[str]:
-    """Names of a role's metrics: told by the code where that is cheap, read in it elsewhere."""
-    if role == "replay":
-        config = Config()
-        return set(ReplayService(config, *build(config), *[MagicMock(refused=0)] * 3).metrics())
-    if role == "learner":
-        config = load_config(None, {"arena.view_px": "31", "learner.device": "cpu"})
-        learner = Learner(config.agent, config.learner, stack=4, view_px=31)
-        batch = random_batch(8)
-        timer = StageTimer(
-            MagicMock(), MagicMock(), None, MagicMock(), Diagnostics(config, learner)
-        )
-        timer.last = (batch, learner.step(batch))
-        return set(timer.metrics())
-    return literal_keys(next(path for path, of in METRICS_OF.items() if of == role))
-
-
-@pytest.mark.parametrize("role", METRICS_OF.values())
+@pytest.mark.parametrize("role", SCHEMAS)
 def test_metrics_are_documented(role: str) -> None:
-    assert set(names(part(page("metrics.md"), f"## {role}"))) == published(role)
-
-
-def test_no_other_service_publishes_metrics() -> None:
-    telling = {
-        str(path.relative_to(ROOT))
-        for path in (ROOT / "services").rglob("*.py")
-        if functions_that_tell(path)
-    }
-    assert telling == set(METRICS_OF)
+    assert names(part(page("metrics.md"), f"## {role}")) == list(kinds(SCHEMAS[role]))
 
 
 def test_run_files_are_documented() -> None:
@@ -341,7 +281,7 @@ def test_measures_of_navigation_are_documented() -> None:
 
 def test_what_inspect_says_is_documented() -> None:
     text = part(page("inspect.md"), "## JSON")
-    said = digest(Contents())
+    said = summarize(Contents())
     assert names(text) == ["log", *said, *said["files"]]
 
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 from mrcdrl.common.errors import TransportError
+from mrcdrl.common.messages.metrics import Metrics, numbers
 from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.heartbeat import Heartbeat
@@ -27,18 +28,18 @@ class StatsReporter:
         """The service did something, or has nothing to do; `at_s`: then, by default now."""
         self._heartbeat.worked(at_s)
 
-    def maybe(self, metrics: Callable[[], dict[str, float]]) -> None:
+    def maybe(self, metrics: Callable[[], Metrics]) -> None:
         """Publish if a second has passed since the last time."""
         if time.monotonic() >= self._due_s:
             self.now(metrics)
 
-    def now(self, metrics: Callable[[], dict[str, float]]) -> None:
+    def now(self, metrics: Callable[[], Metrics]) -> None:
         """Publish, and again in a second."""
         self._due_s = time.monotonic() + 1.0
         try:
-            numbers = {name: float(value) for name, value in metrics().items()}
             text = {**self._text, "clock_ns": str(time.time_ns())}
-            self._publisher.put(encode(Stats(self._role, self._worker, numbers, text)))
+            stats = Stats(self._role, self._worker, numbers(metrics()), text)
+            self._publisher.put(encode(stats))
         except TransportError as error:
             logging.getLogger(self._role).warning("stats not published: %s", error)
         self._heartbeat.beat()

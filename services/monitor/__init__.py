@@ -1,1 +1,1 @@
-"""A run as its watchers know it: state, rates, bottleneck, records, screen."""
+"""A run as seen from outside: its state, rates, bottleneck, records and screen."""

@@ -1,24 +1,13 @@
-"""Which stage of the ring holds the others up, in words.
+"""The bottleneck of the ring: the stage that keeps the others waiting.
 
-Invariants: pure; judged by what replay's limiter held over the last seconds, then by where the
-side that is waited for spends its time.
+Invariants: pure; judged by how often replay's limiter throttled over the last seconds, then by
+where the side that is waited for spends its time.
 """
 
+from mrcdrl.common.messages.metrics import ActorMetrics, LearnerMetrics, ReplayMetrics
 from mrcdrl.services.monitor.state import RunState
 
-HELD = 0.2  # share of the reports from which a limiter counts as holding
-ACTOR_STAGES = {
-    "inference_share": "collection: actors' inference",
-    "arena_share": "collection: actors' arenas",
-    "draw_share": "collection: actors' drawing of images",
-    "wait_share": "the way from the actors to replay",
-}
-LEARNER_STAGES = {
-    "step_share": "the learner's computation",
-    "data_wait_share": "the way from replay to the learner",
-    "decode_share": "the learner's decoding of batches",
-    "publish_share": "the learner's publishing of weights",
-}
+HELD = 0.2  # share of the reports from which a limiter counts as throttling
 
 
 def thousands(number: float) -> str:
@@ -26,24 +15,40 @@ def thousands(number: float) -> str:
     return f"{number:,.0f}".replace(",", "\N{NO-BREAK SPACE}")
 
 
-def limiting_stage(state: RunState) -> str:
-    """What a faster run would need first."""
+def waiting_for(state: RunState) -> str | None:
+    """What has to happen before the ring can turn; None if it turns."""
     for role, name in (("replay", "replay"), ("actor", "an actor"), ("learner", "the learner")):
         if not state.alive(role):
-            return f"waiting for {name} to be there"
-    if state.replay_size < state.config.replay.min_size:
-        return (
-            f"waiting for replay to fill ({thousands(state.replay_size)} of "
-            f"{thousands(state.config.replay.min_size)})"
-        )
-    insert_held = state.share("replay", "insert_held")
-    sample_held = state.share("replay", "sample_held")
-    if sample_held > max(HELD, insert_held):
-        return _largest(state, "actor", ACTOR_STAGES)
-    if insert_held > HELD or state.share("learner", "data_wait_share") < 0.5:
-        return _largest(state, "learner", LEARNER_STAGES)
-    return _largest(state, "actor", ACTOR_STAGES)
+            return f"waiting for {name} to start"
+    size, needed = state.replay_size, state.config.replay.min_size
+    if size < needed:
+        return f"waiting for replay to fill ({thousands(size)} of {thousands(needed)})"
+    return None
 
 
-def _largest(state: RunState, role: str, stages: dict[str, str]) -> str:
-    return stages[max(stages, key=lambda name: state.share(role, name))]
+def bottleneck(state: RunState) -> str:
+    """The stage to speed up first, or what the run waits for."""
+    replay = state.mean_shares("replay", ReplayMetrics)
+    learner = state.mean_shares("learner", LearnerMetrics)
+    learner_is_late = replay.insert_held > HELD or learner.data_wait_share < 0.5
+    if replay.sample_held > max(HELD, replay.insert_held) or not learner_is_late:
+        actor = state.mean_shares("actor", ActorMetrics)
+        shares = {
+            "collection: actor inference": actor.inference_share,
+            "collection: arenas": actor.arena_share,
+            "collection: rendering": actor.draw_share,
+            "actors → replay transfer": actor.wait_share,
+        }
+    else:
+        shares = {
+            "learner computation": learner.step_share,
+            "replay → learner transfer": learner.data_wait_share,
+            "learner decoding of batches": learner.decode_share,
+            "learner publishing of weights": learner.publish_share,
+        }
+    return waiting_for(state) or max(shares, key=lambda stage: shares[stage])
+
+
+def bottleneck_line(state: RunState) -> str:
+    """The bottleneck named as such, or what the run waits for."""
+    return waiting_for(state) or f"bottleneck: {bottleneck(state)}"

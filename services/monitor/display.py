@@ -1,4 +1,4 @@
-"""A run's state on a screen, or as plain lines where there is no terminal."""
+"""Shows the state of a run on a live screen, or as plain lines without a terminal."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ _PLAIN_PERIOD_S = 10.0
 def display(
     state: RunState, config: Config, name: str, clock: Callable[[], float]
 ) -> Iterator[Callable[[], None]]:
-    """A function that shows the state: a live screen, or plain lines where there is no terminal."""
+    """Yield a function that shows the state now: on a live screen, or as a plain line."""
     console = Console()
     if not console.is_terminal:
         due_s = [0.0]
@@ -36,7 +36,7 @@ def display(
 
 @contextmanager
 def logging_to(state: RunState) -> Iterator[None]:
-    """The launcher's own log lines go into the state: written over a screen they would spoil it."""
+    """Send this process's log lines to the state; written to the terminal, they would garble it."""
     root = logging.getLogger()
     streams, root.handlers = root.handlers, [_StateHandler(state)]
     try:

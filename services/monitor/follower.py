@@ -1,4 +1,4 @@
-"""What a run says of itself, folded into the state, the record and the stopping rule."""
+"""Follows a run: feeds its messages to the state, the recorder and the stopping rule."""
 
 import logging
 import time
@@ -19,9 +19,9 @@ M = TypeVar("M")
 
 
 class Follower:
-    """Subscribes to everything a run says of itself.
+    """Subscribes to all statistics, episodes, evaluations and presence of a run.
 
-    recorder: what writes it down; None where nothing does.
+    recorder: writes them down; None to keep no record.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class Follower:
         return time.monotonic() - self._started_s
 
     def listen(self, timeout_s: float) -> bool:
-        """Take in what has arrived, waiting up to `timeout_s` for something; whether any service
-        has told its figures."""
+        """Take in all that has arrived, waiting up to `timeout_s` for statistics; whether any
+        arrived."""
         first = self._stats.take(timeout_s)
         if first is not None:
             self._take(Stats, first[1], lambda s: self._state.observe_stats(s, self.now))
@@ -73,7 +73,7 @@ class Follower:
         return first is not None
 
     def stop_reason(self) -> str | None:
-        """Why the run should end now; minutes count from this start."""
+        """Why the run should end now, or None; minutes count from this start."""
         return self._rule.reason(self._state.learner_steps, self.lived_s / 60)
 
     def _observe_episode(self, episode: EpisodeSummary) -> None:
@@ -92,4 +92,4 @@ class Follower:
         try:
             observe(decode(cls, payload))
         except WireError as error:
-            _LOG.warning("a %s refused: %s", cls.__name__, error)
+            _LOG.warning("%s message refused: %s", cls.__name__, error)

@@ -1,6 +1,6 @@
-"""Sums over the last reports: how fast a counter runs, how often a flag was set, how far apart.
+"""Statistics over recent reports: rate of a counter, mean of a share, spread of a value.
 
-Invariants: no clock inside, times come with the calls and do not fall; nothing older than the
+Invariants: no clock inside; times come with the calls and never fall. Nothing older than the
 window is kept, so memory is bounded by the reports of one window.
 """
 
@@ -14,7 +14,7 @@ SPREAD_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """What the values of a window were like."""
+    """Minimum, mean and 99th percentile of the values in a window."""
 
     min: float
     mean: float
@@ -25,9 +25,9 @@ class Rate:
     """Increments of one counter of one service over the last WINDOW_S seconds."""
 
     def __init__(self, persistent: bool, counted: float = 0.0) -> None:
-        """persistent: the counter outlives its service, so when it falls (back to a checkpoint)
-        nothing was counted; otherwise it started again at 0. counted: of its first value, what
-        somebody counted before."""
+        """persistent: the counter outlives its service. When it falls (back to a checkpoint),
+        nothing was counted; any other counter restarted at 0. counted: the part of its first
+        value that was counted before."""
         self._persistent = persistent
         self._counted = counted
         self._last: float | None = None
@@ -35,7 +35,7 @@ class Rate:
         self._increments: deque[tuple[float, float]] = deque()
 
     def observe(self, value: float, now: float, restarted: bool = False) -> float:
-        """Takes the counter's value; returns what was counted since the value before."""
+        """Take the counter's value; return the increase since the previous one."""
         if self._last is None:
             self._last, self._since_s = value, now
             return value - self._counted if value >= self._counted else value
@@ -48,7 +48,7 @@ class Rate:
         return increment
 
     def per_second(self, now: float) -> float:
-        """Counted in the window, over its seconds (fewer while it has not been seen so long)."""
+        """Increase over the window, or over the time since the first value if that is shorter."""
         self._forget(now)
         span = min(WINDOW_S, now - self._since_s)
         return sum(increment for _, increment in self._increments) / span if span > 0 else 0.0
@@ -59,7 +59,7 @@ class Rate:
 
 
 class Share:
-    """Mean of a flag or share over the reports of the last WINDOW_S seconds."""
+    """Mean of a share or flag over the reports of the last WINDOW_S seconds."""
 
     def __init__(self) -> None:
         self._values: deque[tuple[float, float]] = deque()
@@ -76,7 +76,7 @@ class Share:
 
 
 class Spreading:
-    """Least, mean and 99th percentile of the values of the last SPREAD_S seconds."""
+    """Spread of the values of the last SPREAD_S seconds."""
 
     def __init__(self) -> None:
         self._values: deque[tuple[float, float]] = deque()
@@ -88,7 +88,7 @@ class Spreading:
 
     @property
     def spread(self) -> Spread | None:
-        """None where nothing was reported; p99: of the values the least that 99 % do not exceed."""
+        """None if nothing was reported; p99 is the smallest value that 99 % do not exceed."""
         if not self._values:
             return None
         values = sorted(value for _, value in self._values)

@@ -1,13 +1,14 @@
-"""Writes a run down as it goes: lines of JSON, TensorBoard events, a summary at the end.
+"""Records a run as it goes: lines of JSON, TensorBoard events, a summary at the end.
 
-Invariants: a line is written whole or, after a crash, cut off by the next start; what is recorded
-is on its way to disk at most one `record_metrics` later; a resumed run appends.
+Invariants: a line that a crash left unfinished is cut off by the next start; a record is handed to
+the operating system by the next `record_metrics` at the latest; a resumed run appends.
 """
 
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from mrcdrl.services.monitor.summary import summary_bytes
 
 SUMMARY = "summary.json"
 TENSORBOARD = "tensorboard"
-RATES = ("env_steps", "robot_steps", "learner_steps", "inserts", "samples")
+RATES = tuple(chain.from_iterable(COUNTERS.values()))
 EVALUATION_FIELDS = (
     "success_rate",
     "collision_rate",
@@ -50,7 +51,7 @@ EVALUATION_FIELDS = (
 
 
 class Recorder(Closing):
-    """Owns the open files of one run's directory; close it, or use it in `with`."""
+    """Owns the open record files of one run directory; close it, or use it in `with`."""
 
     def __init__(self, run_dir: Path, config: Config) -> None:
         """Raises RunDirectoryError when the directory cannot be written."""
@@ -71,9 +72,9 @@ class Recorder(Closing):
         return f"Recorder({str(self.run_dir)!r}, closed={self._metrics.closed})"
 
     def restore(self, state: RunState, rule: StoppingRule) -> float:
-        """Folds what earlier processes of this run recorded; returns the seconds it lasted.
+        """Fold earlier records into the state and the rule; return the seconds the run lasted.
 
-        Raises RunDirectoryError when a file is of another version.
+        Raises RunDirectoryError when a file was written by another version.
         """
         metrics = read_last_metrics(self.run_dir)
         time_s = float(metrics.get("time_s", 0.0))
@@ -94,7 +95,7 @@ class Recorder(Closing):
         return time_s
 
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
-        """Writes an episode that `state` has observed."""
+        """Write an episode that `state` has observed."""
         line = episode_line(EpisodeRecord(now, state.learner_steps, episode))
         with self._writing():
             self._episodes.write(line)
@@ -104,7 +105,7 @@ class Recorder(Closing):
             self._event("training/successes_per_100", state.successes_per_100, state.episodes)
 
     def record_evaluation(self, record: EvaluationRecord) -> None:
-        """Writes what `state.observe_evaluation` returned."""
+        """Write what `state.observe_evaluation` returned."""
         with self._writing():
             self._evaluations.write(evaluation_line(record))
             self._evaluations.flush()
@@ -113,7 +114,7 @@ class Recorder(Closing):
             self._event(f"evaluation/{name}", value, record.evaluation.learner_step)
 
     def record_metrics(self, state: RunState, now: float) -> None:
-        """Writes the figures of this second; call it once a second. Flushes all files."""
+        """Write the metrics of this second and flush all files; call it once a second."""
         with self._writing():
             self._metrics.write(to_line(flat_metrics(state, now)))
         for name in RATES:
@@ -124,14 +125,14 @@ class Recorder(Closing):
         self.flush()
 
     def write_summary(self, state: RunState, now: float, stop_reason: str) -> Path:
-        """Writes summary.json in one move; returns its path."""
+        """Write summary.json in one step; return its path."""
         path = self.run_dir / SUMMARY
         with self._writing():
             atomic_write(path, summary_bytes(state, self._config, now, stop_reason))
         return path
 
     def flush(self) -> None:
-        """Hands what is buffered to the operating system."""
+        """Hand buffered records to the operating system."""
         with self._writing():
             for file in (self._episodes, self._evaluations, self._metrics):
                 file.flush()
@@ -139,7 +140,7 @@ class Recorder(Closing):
             self._events.flush()
 
     def close(self) -> None:
-        """Flushes and closes; a second call does nothing."""
+        """Flush and close; a second call does nothing."""
         for file in (self._episodes, self._evaluations, self._metrics):
             with self._writing():
                 file.close()
@@ -160,7 +161,7 @@ class Recorder(Closing):
 
 
 def _open_events(directory: Path) -> Any:
-    """A TensorBoard writer; None where the optional tensorboardX is not installed."""
+    """A TensorBoard writer; None if the optional tensorboardX is not installed."""
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
@@ -169,7 +170,7 @@ def _open_events(directory: Path) -> Any:
 
 
 def flat_metrics(state: RunState, now: float) -> dict[str, float | int | None]:
-    """The state as one flat object; each service's own metrics as role/id/name."""
+    """The state as one flat object, with each service's own metrics as role/id/name."""
     successes = state.successes_per_100
     flat: dict[str, float | int | None] = {
         "time_s": round(now, 3),
@@ -190,7 +191,7 @@ def flat_metrics(state: RunState, now: float) -> dict[str, float | int | None]:
 
 
 def _counted(metrics: Mapping[str, Any]) -> dict[tuple[str, str], float]:
-    """The counters of single actors in a line of metrics, by actor and counter."""
+    """The counters of each actor in a line of metrics, by actor and counter."""
     names = [name.split("/") for name in metrics if name.startswith("actor/")]
     return {
         (actor, name): float(metrics[f"actor/{actor}/{name}"])

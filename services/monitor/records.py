@@ -1,7 +1,7 @@
-"""What a run leaves as lines of JSON: an episode, an evaluation, the metrics of a second.
+"""A run's records as lines of JSON: episodes, evaluations, the metrics of each second.
 
 Invariants: one object a line; a number that is not finite is written as null and read as nan; a
-torn last line is what a crash leaves, and is no error.
+torn last line is what a crash leaves, and not an error.
 """
 
 import json
@@ -19,23 +19,24 @@ Record = TypeVar("Record")
 EPISODES = "episodes.jsonl"
 EVALUATIONS = "evaluations.jsonl"
 METRICS = "metrics.jsonl"
-TAIL_BYTES = 1 << 20
+SUCCESS_WINDOW = 100  # episodes over which successes are counted (Table 1, Fig. 6b)
+_TAIL_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
     """A finished training episode and when it was reported."""
 
-    time_s: float  # of the run, over all resumptions
+    time_s: float  # since the run began, over all resumptions
     learner_steps: int
     episode: EpisodeSummary
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationRecord:
-    """An evaluation, when it was reported and how far collection was by then."""
+    """An evaluation, when it was reported, and the progress of collection by then."""
 
-    time_s: float  # of the run, over all resumptions
+    time_s: float  # since the run began, over all resumptions
     env_steps: int
     robot_steps: int
     evaluation: Evaluation
@@ -43,11 +44,18 @@ class EvaluationRecord:
 
 def to_line(values: Mapping[str, Any]) -> str:
     """One line of strict JSON, newline included."""
-    return json.dumps({name: _finite(value) for name, value in values.items()}) + "\n"
+    return json.dumps(finite(values)) + "\n"
 
 
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def finite(value: Any) -> Any:
+    """The value as strict JSON takes it: numbers that are not finite become null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: finite(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(inner) for inner in value]
+    return value
 
 
 def episode_line(record: EpisodeRecord) -> str:
@@ -64,9 +72,9 @@ def evaluation_line(record: EvaluationRecord) -> str:
     return to_line({**head, **asdict(record.evaluation)})
 
 
-def _pick(values: Mapping[str, Any], noun: type) -> dict[str, Any]:
-    """The fields of `noun`, null read as nan; raises KeyError for one that is missing."""
-    names = [field.name for field in fields(noun)]
+def _pick(values: Mapping[str, Any], message: type) -> dict[str, Any]:
+    """The fields of the message, null read as nan; raises KeyError for one that is missing."""
+    names = [field.name for field in fields(message)]
     return {name: math.nan if values[name] is None else values[name] for name in names}
 
 
@@ -87,7 +95,7 @@ def _evaluation(values: Mapping[str, Any]) -> EvaluationRecord:
 
 
 def _objects(text: bytes) -> Iterator[dict[str, Any]]:
-    """The whole lines that are JSON objects; others (torn, zeroed by a crash) are left out."""
+    """The whole lines that are JSON objects; others (torn, zeroed by a crash) are skipped."""
     for line in text.split(b"\n")[:-1]:
         try:
             values = json.loads(line)
@@ -109,7 +117,7 @@ def _read(path: Path, parse: Callable[[Mapping[str, Any]], Record]) -> list[Reco
 def read_episodes(run_dir: Path) -> list[EpisodeRecord]:
     """Every episode of a run, in the order reported; [] when there is no file.
 
-    Raises RunDirectoryError when a line is whole but is no episode.
+    Raises RunDirectoryError when a whole line is not an episode.
     """
     return _read(run_dir / EPISODES, _episode)
 
@@ -117,7 +125,7 @@ def read_episodes(run_dir: Path) -> list[EpisodeRecord]:
 def read_evaluations(run_dir: Path) -> list[EvaluationRecord]:
     """Every evaluation of a run, in the order reported; [] when there is no file.
 
-    Raises RunDirectoryError when a line is whole but is no evaluation.
+    Raises RunDirectoryError when a whole line is not an evaluation.
     """
     return _read(run_dir / EVALUATIONS, _evaluation)
 
@@ -128,18 +136,18 @@ def read_last_metrics(run_dir: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
         objects = list(_objects(file.read()))
     return objects[-1] if objects else {}
 
 
 def cut_torn_line(path: Path) -> None:
-    """Shortens the file to its last newline, so that what is appended starts a line."""
+    """Cut the file after its last newline, so that the next append starts a line."""
     if not path.exists():
         return
     with path.open("r+b") as file:
         size = file.seek(0, 2)
-        start = max(0, size - TAIL_BYTES)
+        start = max(0, size - _TAIL_BYTES)
         file.seek(start)
         newline = file.read().rfind(b"\n")
         file.truncate(start + newline + 1 if newline >= 0 else start)

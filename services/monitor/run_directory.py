@@ -1,10 +1,10 @@
-"""A run's folder: made new, or taken up again, by one process at a time.
+"""A run directory: created, resumed or joined by one process at a time.
 
     runs/NAME/  config.toml  endpoint (while it runs)  logs/  replay/  checkpoints/
                 tensorboard/  metrics.jsonl  episodes.jsonl  evaluations.jsonl
                 summary.json  training.png  trajectories.png  evaluation.mp4
 
-Invariants: a folder that exists is never taken for a new run; two processes never hold one.
+Invariants: a directory that exists never becomes a new run; two processes never hold one.
 """
 
 import fcntl
@@ -20,20 +20,20 @@ from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, reason
 from mrcdrl.common.sync.joining import ENDPOINT_FILE
 
-_KEPT = ("arena.", "agent.kind", "replay.shards")  # what checkpoints and logs were made with
+_KEPT = ("arena.", "agent.kind", "replay.shards")  # settings that checkpoints and logs depend on
 
 
 def default_name(config_name: str, num_robots: int) -> str:
-    """Such as quick-2robots-20261122-101500."""
+    """A name such as quick-2robots-20261122-101500."""
     stem = Path(config_name).stem
     return f"{stem}-{num_robots}robots-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 class RunDirectory(Closing):
-    """The folder of one run, locked while the object lives.
+    """The directory of one run, locked while the object is open.
 
-    Raises RunDirectoryError where it exists (`create`), does not (`resume`), is in use by
-    another process, or cannot be written.
+    Raises RunDirectoryError if it exists (`create`), is missing (`resume`), is in use by another
+    process, or cannot be written.
     """
 
     def __init__(self, path: Path, config: Config, *, resumed: bool) -> None:
@@ -45,11 +45,11 @@ class RunDirectory(Closing):
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(self._lock)
-            raise RunDirectoryError(f"{path} is in use by a run that is up") from error
+            raise RunDirectoryError(f"{path} is in use by another process") from error
 
     @classmethod
     def create(cls, path: Path, config: Config) -> Self:
-        """A new folder with the resolved configuration."""
+        """Create the directory, with the resolved configuration in it."""
         try:
             path.mkdir(parents=True)
         except FileExistsError as error:
@@ -57,7 +57,7 @@ class RunDirectory(Closing):
                 f"{path} exists; take another --name, or go on with --resume {path.name}"
             ) from error
         except OSError as error:
-            raise RunDirectoryError(f"cannot make {path}: {reason(error)}") from error
+            raise RunDirectoryError(f"cannot create {path}: {reason(error)}") from error
         try:
             return cls._opened(path, config, resumed=False)
         except RunDirectoryError:
@@ -66,25 +66,24 @@ class RunDirectory(Closing):
 
     @classmethod
     def resume(cls, path: Path, overrides: dict[str, str]) -> Self:
-        """A folder there is, with its configuration and what the flags change in it."""
+        """Open an existing run, with its configuration and the flags' changes to it."""
         if not (path / RUN_CONFIG).is_file():
-            raise RunDirectoryError(f"{path} holds no run ({RUN_CONFIG} is missing)")
+            raise RunDirectoryError(f"{path} is not a run ({RUN_CONFIG} is missing)")
         for name in overrides:
             if name.startswith(_KEPT):
                 raise RunDirectoryError(
-                    f"{path} keeps what it was made with: {name} cannot be changed; "
-                    "start a new run for that"
+                    f"{name} cannot be changed: the records in {path} depend on it; start a new run"
                 )
         config = load_config(str(path / RUN_CONFIG), overrides)
         return cls._opened(path, config, resumed=True)
 
     @classmethod
     def join(cls, path: Path, config: Config) -> Self:
-        """The folder of a run that is up, made where it is missing, for who keeps its records."""
+        """Open the directory of a live run to keep its records; create it if it is missing."""
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise RunDirectoryError(f"cannot make {path}: {reason(error)}") from error
+            raise RunDirectoryError(f"cannot create {path}: {reason(error)}") from error
         return cls._opened(path, config, resumed=True)
 
     @classmethod
@@ -102,10 +101,10 @@ class RunDirectory(Closing):
         return self.path / "logs"
 
     def note_endpoint(self, endpoint: str) -> None:
-        """So that `mrcdrl actor --run NAME` on this machine finds the run."""
+        """Write the endpoint, so that `mrcdrl actor --run NAME` on this machine finds the run."""
         atomic_write(self.path / ENDPOINT_FILE, endpoint.encode())
 
     def close(self) -> None:
-        """Release the folder."""
+        """Release the directory."""
         (self.path / ENDPOINT_FILE).unlink(missing_ok=True)
         os.close(self._lock)

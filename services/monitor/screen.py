@@ -1,9 +1,10 @@
-"""The dashboard's screen, and the plain lines where there is no screen.
+"""The live screen of a run, and its state as one plain line.
 
-Invariants: pure, built from RunState and `now` alone; as many rows and columns as the console
-has, down to 80 x 24, with nothing that scrolls.
+Invariants: pure, built from RunState and `now` alone; fills the console's rows and columns, down to
+80 x 24; nothing scrolls. Curves are in braille: two points a column, four levels a row.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,23 +14,25 @@ from rich.table import Table
 from rich.text import Text
 
 from mrcdrl.common.config import Config
-from mrcdrl.services.monitor.bottleneck import limiting_stage, thousands
-from mrcdrl.services.monitor.braille import braille_curve
+from mrcdrl.services.monitor.bottleneck import bottleneck, bottleneck_line, thousands, waiting_for
 from mrcdrl.services.monitor.service_table import ROLE_STYLES, services
 from mrcdrl.services.monitor.state import RunState
 
 FIXED_ROWS = 9  # header, ring, fill, epsilon and the headings
 BAR = "━"
+# Bits of the dots of U+2800, [column 0 or 1][row 0 (top) ... 3].
+_DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
+_BLANK = 0x2800
 
 
 def screen(state: RunState, config: Config, now: float, name: str = "") -> RenderableType:
-    """The whole screen at `now`; `name`: the run's, for the header."""
+    """The whole screen at `now`; name: the run's, for the header."""
     return Screen(state, config, now, name)
 
 
 @dataclass(frozen=True, slots=True)
 class Screen:
-    """Lays itself out for the console it is drawn on."""
+    """Lays itself out for its console."""
 
     state: RunState
     config: Config
@@ -42,7 +45,7 @@ class Screen:
         lines: list[RenderableType] = [
             header(self.state, self.config, self.now, self.name, width),
             *ring(self.state, self.now),
-            heading("who is there"),
+            heading("processes"),
             services(self.state, self.now, rows.services),
             fill(self.state, width),
             exploration(self.state),
@@ -57,7 +60,7 @@ class Screen:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """How many rows each part that can grow may have."""
+    """Rows for each part of variable height."""
 
     services: int
     curve: int
@@ -66,7 +69,7 @@ class Rows:
 
     @classmethod
     def of(cls, height: int, num_services: int) -> "Rows":
-        """Shares the console's height out: services first, then curves, then the rest."""
+        """Divide the console's height: services first, then curves, then the rest."""
         free = max(8, height - FIXED_ROWS)
         services = min(max(num_services, 1), max(4, free * 2 // 5))
         rest = free - services
@@ -76,7 +79,7 @@ class Rows:
 
 
 def clock(seconds: float | None) -> str:
-    """0:12:34; a dash for None."""
+    """Time as 0:12:34; a dash for None."""
     if seconds is None:
         return "–"
     whole = int(seconds)
@@ -89,7 +92,7 @@ def heading(title: str, more: str = "", style: str = "grey62") -> Rule:
 
 
 def header(state: RunState, config: Config, now: float, name: str, width: int) -> Text:
-    """One bar: what runs, and how long yet."""
+    """One bar with the run's name, arena and agent, its time and the time left."""
     robots = f"{config.arena.num_robots} robot{'s' * (config.arena.num_robots != 1)}"
     left = f" mrcdrl  {name + '  ' if name else ''}{robots} · {config.agent.kind}"
     left += f" · {config.arena.target_layout} targets"
@@ -100,7 +103,7 @@ def header(state: RunState, config: Config, now: float, name: str, width: int) -
 
 
 def ring(state: RunState, now: float) -> list[Text]:
-    """The way of the data, with what flows on each arrow, and the counters below."""
+    """The ring with the rate on each arrow, and the counters below."""
     rate = {n: state.per_second(n, now) for n in ("robot_steps", "samples", "learner_steps")}
     line = Text(no_wrap=True, overflow="ellipsis").append("↻ ", style="grey62")
     _stage(line, state, "actor", "actors")
@@ -127,7 +130,7 @@ def _stage(line: Text, state: RunState, role: str, name: str) -> None:
 
 
 def fill(state: RunState, width: int) -> Text:
-    """How full replay is, with the size from which the learner is served."""
+    """The fill level of replay."""
     size, capacity = state.replay_size, max(1, state.replay_capacity)
     numbers = f" {thousands(size)} of {thousands(capacity)}"
     ratio = state.samples_per_insert
@@ -151,11 +154,11 @@ def exploration(state: RunState) -> Text:
         line.append(low if low == high else f"{low} … {high}")
     successes, of = state.recent_successes
     line.append(f"   {thousands(state.episodes)} episodes · ")
-    return line.append(f"{successes} successes of the last {of}", style="bold")
+    return line.append(f"{successes} successes in the last {of}", style="bold")
 
 
 def curves(state: RunState, width: int, height: int) -> Table:
-    """Successes per 100 episodes, and evaluation success, side by side."""
+    """Successes per 100 episodes and evaluation success, side by side."""
     table = Table.grid(expand=True, padding=(0, 1, 0, 0))
     table.add_column(ratio=1)
     table.add_column(ratio=1)
@@ -165,7 +168,7 @@ def curves(state: RunState, width: int, height: int) -> Table:
     training = f"{state.successes_per_100}, best {state.max_successes}" if now_and_best else "–"
     testing = f"{tests[-1]:.1f} %, best {max(tests):.1f} %" if tests else "–"
     table.add_row(
-        heading("successes of 100", training, "cyan"),
+        heading("successes per 100", training, "cyan"),
         heading("evaluation", testing, "green"),
     )
     table.add_row(
@@ -185,6 +188,44 @@ def _curve(values: Sequence[float], width: int, height: int, style: str) -> Text
     return text
 
 
+def resample(values: Sequence[float], num_points: int) -> list[float]:
+    """Means over equal groups of many values, linear interpolation between few."""
+    count = len(values)
+    if count == 0:
+        return []
+    if count < num_points:
+        return [_between(values, i * (count - 1) / (num_points - 1)) for i in range(num_points)]
+    bounds = [i * count // num_points for i in range(num_points + 1)]
+    return [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(bounds)]
+
+
+def _between(values: Sequence[float], position: float) -> float:
+    """The value at a position between two indices."""
+    index = min(int(position), len(values) - 1)
+    after = min(index + 1, len(values) - 1)
+    return values[index] + (position - index) * (values[after] - values[index])
+
+
+def braille_curve(
+    values: Sequence[float], width: int, height: int, low: float, high: float
+) -> list[str]:
+    """The curve of `values` between low and high, in `height` lines of `width` characters.
+
+    Neighbouring points are joined by vertical strokes; values outside are drawn at the edge.
+    """
+    cells = [[_BLANK] * width for _ in range(height)]
+    top = 4 * height - 1
+    before: int | None = None
+    for x, value in enumerate(resample(values, 2 * width)):
+        fraction = min(1.0, max(0.0, (value - low) / (high - low)))
+        level = top - round(fraction * top)
+        start = level if before is None else before + (level > before) - (level < before)
+        for y in range(min(start, level), max(start, level) + 1):
+            cells[y // 4][x // 2] |= _DOTS[x % 2][y % 4]
+        before = level
+    return ["".join(map(chr, row)) for row in cells]
+
+
 def evaluations(state: RunState, num_rows: int) -> Text:
     """The latest evaluations, newest first, the best one marked."""
     text = Text(no_wrap=True, overflow="ellipsis")
@@ -202,12 +243,13 @@ def evaluations(state: RunState, num_rows: int) -> Text:
 
 
 def limit(state: RunState) -> Rule:
-    """Which stage holds the others up; heads the log."""
-    return heading("limited by", limiting_stage(state), "yellow")
+    """The bottleneck, or what the run waits for; heads the log."""
+    waiting = waiting_for(state)
+    return heading(waiting or "bottleneck", "" if waiting else bottleneck(state), "yellow")
 
 
 def log(state: RunState, num_rows: int) -> Text:
-    """The latest warnings, the newest at the bottom."""
+    """The latest warnings, newest at the bottom."""
     lines = list(state.log)[-num_rows:]
     return Text("\n".join(lines), style="yellow", no_wrap=True, overflow="ellipsis")
 
@@ -226,7 +268,7 @@ def plain_line(state: RunState, now: float) -> str:
         f"weights v{state.weights_version}",
         f"successes {successes}/{of}",
         f"evaluation {test}",
-        f"limited by {limiting_stage(state)}",
+        bottleneck_line(state),
     ]
     remaining = state.time_left_s(now)
     if remaining is not None:

@@ -1,6 +1,6 @@
-"""The table of who is there: a row a service, with its key figures.
+"""The table of a run's services: one row each, with its key figures.
 
-Invariants: pure; never more rows than asked for while actors can share one.
+Invariants: pure; keeps to the number of rows asked for by merging actors into one row.
 """
 
 from collections.abc import Sequence
@@ -8,15 +8,22 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
+from mrcdrl.common.messages.metrics import (
+    ActorMetrics,
+    DiagnosticMetrics,
+    EvaluatorMetrics,
+    LearnerMetrics,
+    ReplayMetrics,
+)
 from mrcdrl.services.monitor.bottleneck import thousands
-from mrcdrl.services.monitor.state import WITHOUT_FIGURES, RunState, Service
+from mrcdrl.services.monitor.state import WITHOUT_METRICS, RunState, Service
 
-QUIET_S = 5.0  # after so long without a word a service is shown as silent
+QUIET_S = 5.0  # a service that reports nothing for this long is shown as silent
 ROLE_STYLES = {"actor": "cyan", "replay": "blue", "learner": "magenta", "evaluator": "green"}
 
 
 def services(state: RunState, now: float, num_rows: int) -> Table:
-    """A row a service; actors that do not fit are one row together."""
+    """One row a service; actors that do not fit share one."""
     table = Table(box=None, expand=True, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True, ratio=1, overflow="ellipsis")
@@ -33,7 +40,7 @@ def services(state: RunState, now: float, num_rows: int) -> Table:
     for service in known[len(actors) :]:
         table.add_row(*_service_row(state, service, now))
     if not known:
-        table.add_row(Text("nobody yet", style="grey62"), "", "")
+        table.add_row(Text("none yet", style="grey62"), "", "")
     return table
 
 
@@ -47,55 +54,71 @@ def _service_row(state: RunState, service: Service, now: float) -> tuple[Text, s
 def _actors_row(
     state: RunState, actors: Sequence[Service], more: str, now: float
 ) -> tuple[Text, str, Text]:
-    here = [actor for actor in actors if actor.alive]
-    name = Text(f"{len(here)} {more}actors", style=ROLE_STYLES["actor"])
-    rate = sum(actor.per_second("robot_steps", now) for actor in here)
+    up = [actor for actor in actors if actor.alive]
+    name = Text(f"{len(up)} {more}actors", style=ROLE_STYLES["actor"])
+    rate = sum(actor.per_second("robot_steps", now) for actor in up)
     versions, seconds = state.max_staleness
-    text = f"{thousands(rate)} robot steps/s · ≤ {versions} versions, {seconds:.0f} s behind"
-    gone = len(actors) - len(here)
-    return name, text, Text(f"{gone} gone", style="bold red") if gone else Text("here", "green")
+    weights = f"weights: ≤ {versions} versions behind, ≤ {seconds:.0f} s old"
+    lost = len(actors) - len(up)
+    presence = Text(f"{lost} lost", style="bold red") if lost else Text("up", "green")
+    return name, f"{thousands(rate)} robot steps/s · {weights}", presence
 
 
 def heard(service: Service, now: float) -> Text:
-    """Whether a service is there."""
+    """Whether a service is up, and how long it has been silent."""
     silent = service.silent_s(now)
     if not service.alive:
-        return Text("gone", style="bold red")
-    if service.role in WITHOUT_FIGURES:
-        return Text("here", "green")
+        return Text("lost", style="bold red")
+    if service.role in WITHOUT_METRICS:
+        return Text("up", "green")
     if silent == float("inf"):
         return Text("starting", style="yellow")
-    return Text(f"silent {silent:.0f} s", "yellow") if silent > QUIET_S else Text("here", "green")
+    return Text(f"silent {silent:.0f} s", "yellow") if silent > QUIET_S else Text("up", "green")
 
 
 def figures(state: RunState, service: Service, now: float) -> str:
     """A service's key figures in one line."""
-    m = service.metrics
     if service.heard_s is None:
         return ""
     match service.role:
         case "actor":
-            behind = state.staleness(service)
-            stale = f" · {behind[0]} behind, {behind[1]:.0f} s old" if behind else ""
-            busy = _percent(service, ("inference", "arena", "draw", "wait"))
+            actor = service.read(ActorMetrics)
             slot = "no slot" if service.slot is None else f"slot {service.slot}"
             rate = thousands(service.per_second("robot_steps", now))
-            return f"{slot} · {rate} steps/s{stale} · {busy}"
+            busy = _percent(
+                inference=actor.inference_share,
+                arena=actor.arena_share,
+                render=actor.draw_share,
+                wait=actor.wait_share,
+            )
+            return f"{slot} · {rate} steps/s{_age(state, service)} · {busy}"
         case "replay":
-            refused = int(m.get("refused", 0))
-            lost = f"{int(m.get('gaps', 0))} gaps, {refused} refused"
-            mib = m.get("bytes", 0) / 2**20
-            return f"{mib:,.0f} MiB · {thousands(m.get('chunks', 0))} chunks · {lost}"
+            replay = service.read(ReplayMetrics)
+            lost = f"{replay.gaps:.0f} gaps, {replay.refused:.0f} refused"
+            return f"{replay.bytes / 2**20:,.0f} MiB · {thousands(replay.chunks)} chunks · {lost}"
         case "learner":
-            busy = _percent(service, ("step", "data_wait", "decode"))
-            return f"loss {m.get('loss', 0):.4g} · Q {m.get('mean_q', 0):.3g} · {busy}"
+            learner, last = service.read(LearnerMetrics), service.read(DiagnosticMetrics)
+            busy = _percent(
+                step=learner.step_share, wait=learner.data_wait_share, decode=learner.decode_share
+            )
+            return f"loss {last.loss:.4g} · Q {last.mean_q:.3g} · {busy}"
         case "evaluator":
-            doing = "judging" if m.get("busy") else "waiting after"
-            done = int(m.get("evaluations", 0))
-            return f"{doing} v{int(m.get('weights_version', 0))} · {done} evaluations done"
+            evaluator = service.read(EvaluatorMetrics)
+            doing = "evaluating" if evaluator.busy else "waiting after"
+            done = f"{evaluator.evaluations:.0f} evaluations done"
+            return f"{doing} v{evaluator.weights_version:.0f} · {done}"
     return ""
 
 
-def _percent(service: Service, names: Sequence[str]) -> str:
-    shares = ((name.replace("_", " "), service.share(f"{name}_share")) for name in names)
-    return " ".join(f"{name} {100 * share:.0f}%" for name, share in shares)
+def _age(state: RunState, actor: Service) -> str:
+    """How old an actor's weights are; empty before that is known."""
+    staleness = state.staleness(actor)
+    if staleness is None:
+        return ""
+    behind, seconds = staleness
+    versions = f"{behind} version{'s' * (behind > 1)} behind" if behind else "current"
+    return f" · weights: {versions}, {seconds:.0f} s old"
+
+
+def _percent(**shares: float) -> str:
+    return " ".join(f"{name} {100 * share:.0f}%" for name, share in shares.items())

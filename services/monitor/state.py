@@ -1,8 +1,8 @@
-"""What is known of a run: a fold of its messages into counters, rates, scores and who is there.
+"""The state of a run: its messages folded into counters, rates, scores and the services' presence.
 
-Invariants: no clock, lock or transport inside; `now` is the seconds the run has lasted, over all
-its resumptions, and never falls; everything kept is bounded, except one byte an episode and one
-record an evaluation.
+Invariants: no clock, lock or transport inside; `now` is the number of seconds the run has lasted,
+over all resumptions, and never falls. Everything kept is bounded, except one byte an episode and
+one record an evaluation.
 """
 
 import math
@@ -12,45 +12,41 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from mrcdrl.common.config import Config
+from mrcdrl.common.messages.metrics import M, of_kind, read
 from mrcdrl.common.messages.trajectory import NO_SLOT, EpisodeSummary, Evaluation, Outcome, Stats
 from mrcdrl.services.monitor.rates import Rate, Share, Spread, Spreading
-from mrcdrl.services.monitor.records import EvaluationRecord
+from mrcdrl.services.monitor.records import SUCCESS_WINDOW, EvaluationRecord
 
 ROLES = ("actor", "replay", "learner", "evaluator", "status")
-WITHOUT_FIGURES = ("status",)  # roles that are only there
-# Counters of an actor start at 0 with it; those of the others are kept with the run.
-COUNTERS = {
-    "actor": ("env_steps", "robot_steps"),
-    "replay": ("inserts", "samples"),
-    "learner": ("learner_steps",),
-}
-SHARES = {
-    "actor": ("inference_share", "arena_share", "draw_share", "wait_share"),
-    "replay": ("insert_held", "sample_held"),
-    "learner": ("data_wait_share", "decode_share", "step_share", "publish_share"),
-}
+WITHOUT_METRICS = ("status",)  # roles that announce themselves and publish nothing
+COUNTERS = of_kind("pace")  # an actor's start at 0 with it; the others' are kept with the run
+SHARES = of_kind("share")
 STALENESS = ("versions", "s")
-HUNDRED = 100
-HISTORY_PERIOD = 10  # episodes between two points of the curve of successes
+HISTORY_PERIOD = 10  # episodes between two points of the success curve
 LOG_LINES = 100
 
 
 @dataclass(slots=True)
 class Service:
-    """One process of the run, as last heard of."""
+    """One process of the run, as last heard from."""
 
     role: str
     id: str
     alive: bool = True
-    heard_s: float | None = None  # when its stats last came
+    heard_s: float | None = None  # when its last stats arrived
     metrics: dict[str, float] = field(default_factory=dict)
     text: dict[str, str] = field(default_factory=dict)
     rates: dict[str, Rate] = field(default_factory=dict)
     shares: dict[str, Share] = field(default_factory=dict)
-    staleness: dict[str, Spreading] = field(default_factory=dict)  # of an actor, by unit
+    staleness: dict[str, Spreading] = field(default_factory=dict)  # of an actor's weights, by unit
+
+    def read(self, schema: type[M]) -> M:
+        """Its metrics as last reported, shares averaged over the window."""
+        means = {name: share.mean for name, share in self.shares.items()}
+        return read(schema, self.metrics | means)
 
     def per_second(self, name: str, now: float) -> float:
-        """Rate of one of its counters; 0 for what it does not count."""
+        """Rate of one of its counters; 0 for a counter that it does not have."""
         rate = self.rates.get(name)
         return rate.per_second(now) if rate else 0.0
 
@@ -61,7 +57,7 @@ class Service:
 
     @property
     def slot(self) -> int | None:
-        """The slot of exploration that is leased to it; None for none, or when it has gone."""
+        """The exploration slot leased to it; None if it has none or is lost."""
         slot = int(self.metrics.get("slot", NO_SLOT))
         return slot if self.alive and slot != NO_SLOT else None
 
@@ -71,23 +67,23 @@ class Service:
 
 
 class RunState:
-    """The run as the dashboard knows it; `observe_*` folds in a message, the rest reads."""
+    """The run as seen from outside; `observe_*` folds in a message, everything else reads."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.resumed_at_s = 0.0  # seconds the run had lasted when it was taken up again
+        self.resumed_at_s = 0.0  # seconds the run had lasted when it was resumed
         self.log: deque[str] = deque(maxlen=LOG_LINES)
         self.evaluations: list[EvaluationRecord] = []
         self.episodes = 0
         self.max_successes = 0  # of 100 consecutive episodes
         self.success_history: list[int] = []  # successes_per_100, every HISTORY_PERIOD episodes
-        self.recent_scores: deque[float] = deque(maxlen=HUNDRED)
-        self.recent_q: deque[float] = deque(maxlen=HUNDRED)
+        self.recent_scores: deque[float] = deque(maxlen=SUCCESS_WINDOW)
+        self.recent_q: deque[float] = deque(maxlen=SUCCESS_WINDOW)
         self._outcomes = bytearray()
         self._services: dict[tuple[str, str], Service] = {}
         self._collected = {"env_steps": 0.0, "robot_steps": 0.0}
-        self._counted: dict[tuple[str, str], float] = {}  # by who kept the record before
-        self._learner_steps_before = 0  # until the learner of this start is heard of
+        self._counted: dict[tuple[str, str], float] = {}  # by an earlier recorder
+        self._learner_steps_before = 0  # until the learner reports again
 
     def __repr__(self) -> str:
         return (
@@ -96,10 +92,10 @@ class RunState:
             f"learner_steps={self.learner_steps})"
         )
 
-    # -- what happens ------------------------------------------------------------------
+    # -- observations ------------------------------------------------------------------
 
     def observe_stats(self, stats: Stats, now: float) -> None:
-        """Takes a service's figures; a fallen counter or a new `incarnation` is a restart."""
+        """Take a service's metrics; a fallen counter or a new `incarnation` means a restart."""
         service = self._service(stats.role, stats.id)
         before = service.text.get("incarnation")
         restarted = before is not None and before != stats.text.get("incarnation", before)
@@ -131,17 +127,17 @@ class RunState:
                 self.success_history.append(successes)
 
     def observe_evaluation(self, evaluation: Evaluation, now: float) -> EvaluationRecord:
-        """Takes an evaluation; returns it with how far collection was."""
+        """Take an evaluation; return it with the progress of collection."""
         record = EvaluationRecord(now, self.env_steps, self.robot_steps, evaluation)
         self.evaluations.append(record)
         return record
 
     def observe_presence(self, role: str, service_id: str, alive: bool) -> None:
-        """A service's liveliness token came or went."""
+        """Note that a service's liveliness token appeared or vanished."""
         self._service(role, service_id).alive = alive
 
     def observe_log(self, line: str) -> None:
-        """A warning for the screen."""
+        """Keep a warning for the screen."""
         self.log.append(line)
 
     def restore_counted(
@@ -151,9 +147,9 @@ class RunState:
         learner_steps: float,
         by_actor: Mapping[tuple[str, str], float] = MappingProxyType({}),
     ) -> None:
-        """Adds what the run's actors collected before; the learner counts on by itself.
+        """Add what the run's actors collected before; the learner's counter continues by itself.
 
-        by_actor: what is in these of actors that may be there still, by actor and counter.
+        by_actor: the part counted by actors that may still be up, by actor and counter.
         """
         self._counted.update(by_actor)
         self._collected["env_steps"] += env_steps
@@ -163,29 +159,29 @@ class RunState:
     def _service(self, role: str, service_id: str) -> Service:
         return self._services.setdefault((role, service_id), Service(role, service_id))
 
-    # -- who is there -------------------------------------------------------------------
+    # -- services -----------------------------------------------------------------------
 
     @property
     def services(self) -> list[Service]:
-        """Every service ever heard of, along the ring, then by id."""
+        """Every service ever seen, along the ring, then by id."""
         order = {role: index for index, role in enumerate(ROLES)}
         return sorted(
             self._services.values(), key=lambda s: (order.get(s.role, len(order)), s.role, s.id)
         )
 
     def alive(self, role: str) -> list[Service]:
-        """The services of a role that are there, by id."""
+        """The services of a role that are up, by id."""
         return [s for s in self.services if s.role == role and s.alive]
 
     def gauges(self, role: str, name: str) -> list[float]:
-        """A metric of every service of a role that is there and reports it."""
+        """A metric of every service of a role that is up and reports it."""
         return [s.metrics[name] for s in self.alive(role) if name in s.metrics]
 
     def _known(self, role: str, name: str) -> float:
-        """Sum of a metric over a role's services that are there, else the last one heard of."""
+        """Sum of a metric over a role's services that are up, else the value last reported."""
         heard = [s for s in self._services.values() if s.role == role and name in s.metrics]
-        there = [s for s in heard if s.alive] or sorted(heard, key=lambda s: s.heard_s or 0.0)[-1:]
-        return sum(s.metrics[name] for s in there)
+        known = [s for s in heard if s.alive] or sorted(heard, key=lambda s: s.heard_s or 0.0)[-1:]
+        return sum(s.metrics[name] for s in known)
 
     # -- counters and rates ---------------------------------------------------------------
 
@@ -214,17 +210,17 @@ class RunState:
         return int(self._known("replay", "samples"))
 
     def per_second(self, name: str, now: float) -> float:
-        """Rate of a counter over the last seconds, summed over all that count it: env_steps,
-        robot_steps, inserts, samples, learner_steps."""
+        """Rate of one of COUNTERS over the last seconds, summed over all services."""
         return sum(service.per_second(name, now) for service in self._services.values())
 
-    def share(self, role: str, name: str) -> float:
-        """Mean of a share (0 ... 1) over the role's services that are there."""
+    def mean_shares(self, role: str, schema: type[M]) -> M:
+        """Shares (0 ... 1) averaged over the role's services that are up; 0 for other metrics."""
         services = self.alive(role)
-        return sum(s.share(name) for s in services) / max(1, len(services))
+        count = max(1, len(services))
+        return read(schema, {n: sum(s.share(n) for s in services) / count for n in SHARES[role]})
 
     def staleness(self, actor: Service) -> tuple[int, float] | None:
-        """An actor's weights: versions behind the learner's, and seconds since it adopted them."""
+        """Versions that an actor's weights are behind the learner's, and their age in seconds."""
         learner = self.gauges("learner", "weights_version")
         if not learner or "weights_version" not in actor.metrics:
             return None
@@ -233,13 +229,13 @@ class RunState:
 
     @property
     def max_staleness(self) -> tuple[int, float]:
-        """The worst of all actors, in versions and in seconds, each by itself."""
+        """Maximum over all actors, of versions and of seconds separately."""
         known = [s for s in map(self.staleness, self.alive("actor")) if s is not None]
         return max((b for b, _ in known), default=0), max((a for _, a in known), default=0.0)
 
     @property
     def staleness_spreads(self) -> dict[str, dict[str, Spread]]:
-        """Of each actor ever heard of, by unit: over its reports of the last ten minutes."""
+        """Staleness of each actor ever seen, by unit, over its reports of the last ten minutes."""
         return {
             s.id: {unit: spread for unit, each in s.staleness.items() if (spread := each.spread)}
             for s in self.services
@@ -258,13 +254,13 @@ class RunState:
 
     @property
     def samples_per_insert(self) -> float | None:
-        """Transitions sampled for each inserted, as replay counts them; None before it does."""
+        """Transitions sampled for each one inserted, as replay reports; None before it does."""
         reported = self.gauges("replay", "samples_per_insert")
         return sum(reported) / len(reported) if reported else None
 
     @property
     def epsilons(self) -> tuple[float, float] | None:
-        """Least and greatest epsilon of all actors."""
+        """Smallest and largest epsilon of all actors."""
         low, high = self.gauges("actor", "epsilon_min"), self.gauges("actor", "epsilon_max")
         return (min(low), max(high)) if low and high else None
 
@@ -272,20 +268,20 @@ class RunState:
 
     @property
     def successes_per_100(self) -> int | None:
-        """Successes of the last 100 episodes; None before there are as many."""
-        return sum(self._outcomes[-HUNDRED:]) if len(self._outcomes) >= HUNDRED else None
+        """Successes in the last 100 episodes; None before there are 100."""
+        return self.recent_successes[0] if self.episodes >= SUCCESS_WINDOW else None
 
     @property
     def recent_successes(self) -> tuple[int, int]:
-        """Successes, and of how many: the last 100 episodes, or all while they are fewer."""
-        latest = self._outcomes[-HUNDRED:]
+        """Successes and number of the last 100 episodes, or of all if there are fewer."""
+        latest = self._outcomes[-SUCCESS_WINDOW:]
         return sum(latest), len(latest)
 
     @property
     def hundreds(self) -> list[int]:
-        """Successes of the first, second, ... 100 episodes (Table 1, Fig. 6b)."""
-        whole = len(self._outcomes) // HUNDRED * HUNDRED
-        return [sum(self._outcomes[i : i + HUNDRED]) for i in range(0, whole, HUNDRED)]
+        """Successes in the first, second, ... 100 episodes (Table 1, Fig. 6b)."""
+        size, outcomes = SUCCESS_WINDOW, self._outcomes
+        return [sum(outcomes[i - size : i]) for i in range(size, len(outcomes) + 1, size)]
 
     @property
     def last_evaluation(self) -> EvaluationRecord | None:
@@ -293,11 +289,11 @@ class RunState:
 
     @property
     def best_evaluation(self) -> EvaluationRecord | None:
-        """Of the highest success rate; of equal ones the first."""
+        """The evaluation with the highest success rate, the first of equal ones."""
         return max(self.evaluations, key=lambda r: r.evaluation.success_rate, default=None)
 
     def time_left_s(self, now: float) -> float | None:
-        """Until `run.minutes` or, at the present rate, `run.learner_steps`; None: no end known."""
+        """Time until run.minutes or, at the present rate, run.learner_steps; None if unlimited."""
         run, ends = self.config.run, []
         if run.minutes:
             ends.append(max(0.0, 60 * run.minutes - (now - self.resumed_at_s)))

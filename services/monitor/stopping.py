@@ -1,29 +1,28 @@
 """When a run ends by itself: enough time, steps or success, or the paper's patience.
 
-Invariants: no clock inside; a rule set to 0 never speaks; the order of the questions is fixed, so
-the same run always ends for the same reason.
+Invariants: no clock inside; a limit of 0 is off; the limits are checked in a fixed order, so the
+same run always ends for the same reason.
 """
 
 from collections import deque
 
 from mrcdrl.common.config import RunConfig
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
-
-HUNDRED = 100
+from mrcdrl.services.monitor.records import SUCCESS_WINDOW
 
 
 class StoppingRule:
-    """Fed with what happens, says why the run is over.
+    """Observes episodes and evaluations, and says why the run is over.
 
     The paper's rule (section 5.2): "the training can be stopped when a certain size is satisfied
-    and when no larger value appears in the next 1000 episodes". The value is the successes of
-    the last 100 episodes, taken after each episode from the 100th on; the certain size is
-    `patience_floor`.
+    and when no larger value appears in the next 1000 episodes". The value is the number of
+    successes in the last 100 episodes, taken after each episode from the 100th on; the certain
+    size is `patience_floor`.
     """
 
     def __init__(self, run: RunConfig) -> None:
         self._run = run
-        self._latest: deque[bool] = deque(maxlen=HUNDRED)
+        self._latest: deque[bool] = deque(maxlen=SUCCESS_WINDOW)
         self._episodes = 0
         self._maximum = -1
         self._maximum_at = 0
@@ -33,7 +32,7 @@ class StoppingRule:
         self._episodes += 1
         self._latest.append(episode.outcome is Outcome.SUCCESS)
         successes = sum(self._latest)
-        if len(self._latest) == HUNDRED and successes > self._maximum:
+        if len(self._latest) == SUCCESS_WINDOW and successes > self._maximum:
             self._maximum, self._maximum_at = successes, self._episodes
 
     def observe_evaluation(self, evaluation: Evaluation) -> None:
@@ -42,7 +41,7 @@ class StoppingRule:
             self._reached = evaluation
 
     def reason(self, learner_steps: int, minutes: float) -> str | None:
-        """Why the run is over, in words; None while it goes on."""
+        """Why the run is over; None while it goes on."""
         run = self._run
         if self._reached is not None:
             return (
@@ -50,11 +49,11 @@ class StoppingRule:
                 f"run.target_success_rate {run.target_success_rate:g}"
             )
         if run.learner_steps and learner_steps >= run.learner_steps:
-            return f"run.learner_steps {run.learner_steps} done"
+            return f"learner step limit reached ({run.learner_steps})"
         if run.minutes and minutes >= run.minutes:
-            return f"run.minutes {run.minutes:g} over"
+            return f"time limit reached ({run.minutes:g} min)"
         since = self._episodes - self._maximum_at
-        satisfied = self._maximum >= run.patience_floor * HUNDRED
+        satisfied = self._maximum >= run.patience_floor * SUCCESS_WINDOW
         if run.patience_episodes and satisfied and since >= run.patience_episodes:
             return (
                 f"no new maximum above {self._maximum} successes of 100 episodes "

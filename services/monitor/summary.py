@@ -1,34 +1,32 @@
 """The summary of a run: what it reached, at what cost, on which machine.
 
-Invariants: figures that were never reached or measured are null; torch is named, never imported.
+Invariants: figures that were never reached or measured are null; torch is never imported.
 """
 
 import json
-import math
 import os
 import platform
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import fmean, pvariance
 from typing import Any
 
 from mrcdrl.common.config import Config
-from mrcdrl.services.monitor.records import EvaluationRecord
+from mrcdrl.common.runtime.versions import all_versions
+from mrcdrl.services.monitor.records import EvaluationRecord, finite
 from mrcdrl.services.monitor.state import RunState
 
 REACHED = (0.5, 0.8, 0.9, 0.94)
-PACKAGES = {"mrcdrl": "mrcdrl", "zenoh": "eclipse-zenoh", "numpy": "numpy", "torch": "torch"}
 
 
 def summary_bytes(state: RunState, config: Config, now: float, stop_reason: str) -> bytes:
     """The summary as JSON, indented for a reader."""
     values = summary(state, config, now, stop_reason)
-    return (json.dumps(_finite(values), indent=2) + "\n").encode()
+    return (json.dumps(finite(values), indent=2) + "\n").encode()
 
 
 def summary(state: RunState, config: Config, now: float, stop_reason: str) -> dict[str, Any]:
-    """Everything a comparison of runs asks for; `now` is the seconds the run lasted."""
+    """Everything that runs are compared by; `now`: seconds the run lasted."""
     return {
         "stop_reason": stop_reason,
         "wall_s": round(now, 3),
@@ -52,13 +50,13 @@ def summary(state: RunState, config: Config, now: float, stop_reason: str) -> di
             "best": _evaluation(state.best_evaluation),
         },
         "reached": {f"{rate:g}": _reached(state, rate) for rate in REACHED},
-        "versions": versions(),
+        "versions": all_versions(),
         "machine": machine(),
     }
 
 
 def training_table(state: RunState) -> dict[str, float | int | None]:
-    """Table 1: maximum, average and variance over each 100 episodes; `last`: the latest 100."""
+    """Table 1: maximum, average and variance over blocks of 100 episodes; last: the latest 100."""
     hundreds = state.hundreds
     return {
         "last": state.successes_per_100,
@@ -81,7 +79,7 @@ def _evaluation(record: EvaluationRecord | None) -> dict[str, Any] | None:
 
 
 def _reached(state: RunState, rate: float) -> dict[str, float | int] | None:
-    """Cost of the first evaluation with that success rate; its weights' learner step."""
+    """Cost of the first evaluation with that success rate; the step is that of its weights."""
     for record in state.evaluations:
         if record.evaluation.success_rate >= rate:
             return {
@@ -92,19 +90,8 @@ def _reached(state: RunState, rate: float) -> dict[str, float | int] | None:
     return None
 
 
-def versions() -> dict[str, str | None]:
-    """Of Python and of what decides a run's figures; null: not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for name, package in PACKAGES.items():
-        try:
-            found[name] = version(package)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
-
-
 def machine() -> dict[str, Any]:
-    """The host the summary is written on; load is that of now, over 1, 5 and 15 minutes."""
+    """This host; load: averages over the last 1, 5 and 15 minutes."""
     memory = _field(Path("/proc/meminfo"), "MemTotal")
     return {
         "cpu": _field(Path("/proc/cpuinfo"), "model name") or platform.processor() or None,
@@ -115,21 +102,10 @@ def machine() -> dict[str, Any]:
 
 
 def _field(path: Path, name: str) -> str | None:
-    """Value of the first `name : value` line of a file of /proc; None where there is none."""
+    """Value of the first `name : value` line of a file in /proc; None if there is none."""
     try:
         lines = path.read_text("utf-8").splitlines()
     except OSError:
         return None
     pairs = (line.partition(":") for line in lines)
     return next((value.strip() for key, _, value in pairs if key.strip() == name), None)
-
-
-def _finite(value: Any) -> Any:
-    """Numbers JSON has no word for as null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {name: _finite(inner) for name, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(inner) for inner in value]
-    return value

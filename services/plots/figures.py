@@ -1,7 +1,7 @@
-"""A finished or running run as images: its training curve, and paths driven in the arena.
+"""Figures of a finished or running run: its training curve, and robots' paths in the arena.
 
-Invariants: drawn with matplotlib's Figure on Agg, no global state; an empty run gives an empty
-but labelled image.
+Invariants: plotted with matplotlib's Figure on Agg, without global state; an empty run gives an
+empty but labelled figure.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,16 +23,16 @@ from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome
 from mrcdrl.common.runtime.files import reason
 from mrcdrl.services.monitor.records import (
+    SUCCESS_WINDOW,
     EpisodeRecord,
     EvaluationRecord,
     read_episodes,
     read_evaluations,
 )
 
-HUNDRED = 100
 DPI = 130
 LIGHT_BLUE, DARK_BLUE, GREEN = "#a9cbe8", "#123c73", "#2a7f3f"
-# One hue a robot: from the light of the start to the dark of the end.
+# One hue for each robot: light at the start, dark at the end.
 ROBOT_HUES = (
     ("#cfe3f5", "#0b3c73"),
     ("#fbdcc0", "#9c3d04"),
@@ -49,7 +49,7 @@ ROBOT_HUES = (
 
 @dataclass(frozen=True, slots=True)
 class Path2D:
-    """One episode's paths, as `trajectories` draws them."""
+    """One episode's paths, as `trajectories` plots them."""
 
     robots: Float64Array  # [T, K, 3], x_px, y_px, heading_rad
     targets: Float64Array  # [M, 2], centres in px
@@ -58,16 +58,18 @@ class Path2D:
 
 
 def training_curve(run_dir: Path, out: Path) -> None:
-    """The run's curve as a PNG at `out` (paper Fig. 6, and the test while it trains).
+    """Plot the training curve of a run to `out` (paper Fig. 6, and its evaluations).
 
     (a) mean score of episodes; (b) successes per 100 episodes with their running maxima; (c)
-    evaluation success with its 95 % interval. Raises RunDirectoryError for a foreign file.
+    evaluation success with its 95 % interval.
+
+    Raises RunDirectoryError for records of another version.
     """
     episodes, tests = read_episodes(run_dir), read_evaluations(run_dir)
     figure = Figure(figsize=(9, 11), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     score, successes, evaluation = figure.subplots(3, 1)
-    group = 10 * HUNDRED if len(episodes) >= 40 * HUNDRED else HUNDRED
+    group = SUCCESS_WINDOW * (10 if len(episodes) >= 40 * SUCCESS_WINDOW else 1)
     _draw_scores(score, episodes, group)
     _draw_successes(successes, episodes, group)
     _draw_evaluations(evaluation, tests)
@@ -79,9 +81,9 @@ def _draw_scores(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -> N
     scores = np.array([record.episode.score for record in episodes])
     dress(axes, "(a) score of an episode, mean over its robots", "episodes", "score")
     if not episodes:
-        say(axes, "no episode")
+        say(axes, "no episodes")
     else:
-        each = max(1, min(HUNDRED, len(scores) // 20))
+        each = max(1, min(SUCCESS_WINDOW, len(scores) // 20))
         label = f"mean of {each} episodes" if each > 1 else "each episode"
         axes.plot(*means(scores, each), color=LIGHT_BLUE, lw=1.2, label=label)
         if len(scores) >= 2 * group:
@@ -95,17 +97,17 @@ def _draw_successes(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -
     won = np.array([record.episode.outcome is Outcome.SUCCESS for record in episodes], float)
     dress(axes, "(b) successes per 100 episodes", "episodes", "successes")
     axes.set_ylim(-2, 112)
-    if len(won) < HUNDRED:
+    if len(won) < SUCCESS_WINDOW:
         say(axes, f"{int(won.sum())} successes in {len(won)} episodes, fewer than 100")
     else:
-        counted, values = means(HUNDRED * won, HUNDRED)
-        if group > HUNDRED:
+        counted, values = means(SUCCESS_WINDOW * won, SUCCESS_WINDOW)
+        if group > SUCCESS_WINDOW:
             axes.plot(counted, values, color=LIGHT_BLUE, lw=1.2, label="each 100 episodes")
             label = f"mean of {group} episodes"
-            axes.plot(*means(HUNDRED * won, group), color=DARK_BLUE, lw=2, label=label)
+            axes.plot(*means(SUCCESS_WINDOW * won, group), color=DARK_BLUE, lw=2, label=label)
         else:
-            sliding = np.convolve(won, np.ones(HUNDRED), "valid")
-            middles = np.arange(len(sliding)) + (HUNDRED + 1) / 2
+            sliding = np.convolve(won, np.ones(SUCCESS_WINDOW), "valid")
+            middles = np.arange(len(sliding)) + (SUCCESS_WINDOW + 1) / 2
             axes.plot(middles, sliding, color=LIGHT_BLUE, lw=1.2, label="any 100 in a row")
             axes.plot(counted, values, color=DARK_BLUE, lw=2, label="each 100 episodes")
         before = np.concatenate(([-1.0], np.maximum.accumulate(values)[:-1]))
@@ -135,7 +137,7 @@ def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
     tests = sorted(tests, key=lambda record: record.evaluation.learner_step)
     steps = np.array([record.evaluation.learner_step for record in tests], float)
     if not tests:
-        say(axes, "no evaluation")
+        say(axes, "no evaluations")
     else:
         rates = 100 * np.array([record.evaluation.success_rate for record in tests])
         bounds = 100 * np.array([record.evaluation.success_interval for record in tests])
@@ -157,17 +159,19 @@ def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
 
 
 def means(values: Float64Array, group: int) -> tuple[Float64Array, Float64Array]:
-    """Episode in the middle of each whole group, and the group's mean."""
+    """Middle episode and mean of each whole group."""
     whole = len(values) // group
     middles: Float64Array = group * (np.arange(whole, dtype=np.float64) + 0.5) + 0.5
     return middles, values[: whole * group].reshape(whole, group).mean(axis=1)
 
 
 def say(axes: Axes, words: str) -> None:
+    """Write words in the middle of empty axes."""
     axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", color="#777777")
 
 
 def dress(axes: Axes, title: str, x: str, y: str) -> None:
+    """Set title, labels, grid and number format."""
     axes.set_title(title, loc="left", fontsize=11)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -179,11 +183,11 @@ def dress(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def _minutes(axes: Axes, positions: Any, times_s: Sequence[float]) -> None:
-    """A second axis at the top: the minutes at which the positions were reached."""
+    """Add a second axis at the top: the minutes at which the positions were reached."""
     if len(times_s) < 2 or times_s[-1] <= times_s[0] or positions[-1] <= positions[0]:
         return
     minutes = np.maximum.accumulate(np.asarray(times_s)) / 60
-    slope = np.linspace(0, 1e-6, len(minutes))  # inverted below, so it has to rise
+    slope = np.linspace(0, 1e-6, len(minutes))  # inverted below, so it must increase
     to_minutes = _interpolation(np.asarray(positions, float) + slope, minutes + slope)
     to_position = _interpolation(minutes + slope, np.asarray(positions, float) + slope)
     top = axes.secondary_xaxis("top", functions=(to_minutes, to_position))
@@ -193,7 +197,7 @@ def _minutes(axes: Axes, positions: Any, times_s: Sequence[float]) -> None:
 
 
 def _interpolation(x: Float64Array, y: Float64Array) -> Callable[[Any], Any]:
-    """Linear between the points, and beyond them with their mean slope."""
+    """Linear between the points, and beyond them with the mean slope."""
     slope = (y[-1] - y[0]) / (x[-1] - x[0])
 
     def at(value: Any) -> Any:
@@ -205,10 +209,10 @@ def _interpolation(x: Float64Array, y: Float64Array) -> Callable[[Any], Any]:
 
 
 def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> None:
-    """A grid of episodes as an image at `out` (paper Fig. 8).
+    """Plot a grid of episodes to `out` (paper Fig. 8).
 
-    Each robot's path is shaded from light (start) to dark (end) in its own hue; red circles:
-    starts; blue squares: targets; red lines: walls; green discs: obstacles.
+    Each robot's path is shaded from light (start) to dark (end) in its own hue. Red circles are
+    starts, blue squares targets, red lines walls, green discs obstacles.
     """
     columns = min(4, max(1, len(episodes)))
     rows = max(1, -(-len(episodes) // columns))
@@ -223,14 +227,23 @@ def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> 
 
 
 def save(figure: Figure, out: Path) -> None:
-    """Writes it in the format that the name's suffix says; raises MrcdrlError where it cannot."""
+    """Write the figure in the format of the suffix; raise MrcdrlError if that fails."""
     try:
         figure.savefig(out)
     except OSError as error:
         raise MrcdrlError(f"figure {out} cannot be written: {reason(error)}") from error
 
 
+def check_suffix(path: Path, suffixes: Sequence[str]) -> None:
+    """Raise MrcdrlError unless the path has one of these suffixes."""
+    if path.suffix not in suffixes:
+        *others, last = suffixes
+        allowed = f"{', '.join(others)} or {last}"
+        raise MrcdrlError(f"{path}: unsupported extension {path.suffix!r}; use {allowed}")
+
+
 def draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
+    """Plot the arena and one episode's paths in it."""
     _draw_arena(axes, episode, config)
     radius = config.robot_radius_px
     for k in range(episode.robots.shape[1]):

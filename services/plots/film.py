@@ -1,7 +1,7 @@
-"""Films of episodes: the arena, what each robot sees of it, a line of words.
+"""Films of episodes: the arena, what each robot sees of it, and a caption.
 
-Invariants: frames are uint8 BGR of one size; a film is H.264 that every player shows, or a GIF
-that every page shows: half as wide and high, every third frame. Neither is held in memory.
+Invariants: frames are uint8 BGR of one size. A film is H.264, which every player shows, or a GIF,
+which every page shows: half as wide and high, every third frame. Neither is held in memory.
 """
 
 from collections.abc import Callable, Iterable
@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.messages.trajectory import UInt8Array
+from mrcdrl.services.plots.figures import check_suffix
 
 BACKGROUND = 24
 CAPTION_PX, LABEL_PX, GAP_PX = 40, 22, 12
@@ -27,29 +28,31 @@ FONT = "fonts/ttf/DejaVuSans.ttf"
 
 
 def write_film(path: Path, frames: Iterable[UInt8Array], fps: int) -> int:
-    """Writes the frames (uint8 BGR [H, W, 3], all of one size); returns how many it has got.
+    """Write the frames (uint8 BGR [H, W, 3], all of one size); return the number written.
 
-    The suffix chooses: .mp4 or .gif. An odd height or width loses its last row or column. Raises
-    MrcdrlError for another suffix, when there is no frame, when sizes differ, or when the file or
-    the encoder fails.
+    The suffix chooses the format, .mp4 or .gif. An odd height or width loses its last row or
+    column. Raises MrcdrlError for another suffix, for no frames, for frames of different sizes,
+    and when the file or the encoder fails.
     """
-    check_suffix(path)
-    form = _FORMS[path.suffix]
+    check_suffix(path, SUFFIXES)
+    encoding = _FORMATS[path.suffix]
     num_frames = 0
     shape: tuple[int, ...] | None = None
     try:
         with av.open(str(path), "w") as container:
-            stream = container.add_stream(form.codec, rate=Fraction(fps, form.every))
-            stream.pix_fmt = form.pixels
-            stream.options = form.options
-            for frame in islice(frames, 0, None, form.every):
+            stream = container.add_stream(encoding.codec, rate=Fraction(fps, encoding.every))
+            stream.pix_fmt = encoding.pixels
+            stream.options = encoding.options
+            for frame in islice(frames, 0, None, encoding.every):
                 height, width = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
-                image = form.image(np.ascontiguousarray(frame[:height, :width]))
+                image = encoding.image(np.ascontiguousarray(frame[:height, :width]))
                 if shape is None:
                     shape = frame.shape
                     stream.height, stream.width = image.height, image.width
                 if frame.shape != shape:
-                    raise MrcdrlError(f"film {path}: a frame is {frame.shape}, the first {shape}")
+                    raise MrcdrlError(
+                        f"film {path}: a frame is {frame.shape}, the first one {shape}"
+                    )
                 container.mux(stream.encode(image))
                 num_frames += 1
             if num_frames:
@@ -58,25 +61,19 @@ def write_film(path: Path, frames: Iterable[UInt8Array], fps: int) -> int:
         raise MrcdrlError(f"film {path} cannot be written: {error}") from error
     if not num_frames:
         path.unlink(missing_ok=True)
-        raise MrcdrlError(f"film {path} has no frame")
+        raise MrcdrlError(f"film {path} has no frames")
     return num_frames
 
 
-def check_suffix(path: Path) -> None:
-    """Raises MrcdrlError unless films of that name can be written."""
-    if path.suffix not in _FORMS:
-        raise MrcdrlError(f"film {path}: the name ends in none of {', '.join(_FORMS)}")
-
-
 @dataclass(frozen=True, slots=True)
-class _Form:
-    """How a kind of film is encoded."""
+class _Format:
+    """Encoding of a film."""
 
     codec: Literal["libx264", "gif"]
     pixels: str  # format of the encoder's images
     options: dict[str, object]
-    every: int  # one frame of so many is kept
-    image: Callable[[UInt8Array], av.VideoFrame]  # of a frame of even size
+    every: int  # one frame in so many is kept
+    image: Callable[[UInt8Array], av.VideoFrame]  # takes a frame of even size
 
 
 def _whole(frame: UInt8Array) -> av.VideoFrame:
@@ -84,7 +81,7 @@ def _whole(frame: UInt8Array) -> av.VideoFrame:
 
 
 def _small(frame: UInt8Array) -> av.VideoFrame:
-    """Half the size, in the palette's colours."""
+    """The frame at half its size, in the palette's colours."""
     half = Image.fromarray(frame[..., ::-1]).reduce(2)
     indices = half.quantize(palette=_palette(), dither=Image.Dither.NONE)
     argb = np.insert(_colours(), 0, 255, axis=1)
@@ -93,7 +90,7 @@ def _small(frame: UInt8Array) -> av.VideoFrame:
 
 @cache
 def _colours() -> UInt8Array:
-    """The film's: intensities, and red and blue on black and on white; RGB [256, 3]."""
+    """Intensities, and red and blue on black and on white; RGB [256, 3]."""
     intensities = np.linspace((0, 0, 0), (255, 255, 255), 128)
     ramps = [
         np.linspace(paint, ground, 32)
@@ -110,17 +107,18 @@ def _palette() -> Image.Image:
     return image
 
 
-_FORMS = {
-    ".mp4": _Form("libx264", "yuv420p", {"crf": "20"}, 1, _whole),
-    ".gif": _Form("gif", "pal8", {}, 3, _small),
+_FORMATS = {
+    ".mp4": _Format("libx264", "yuv420p", {"crf": "20"}, 1, _whole),
+    ".gif": _Format("gif", "pal8", {}, 3, _small),
 }
+SUFFIXES = tuple(_FORMATS)
 
 
 def compose_frame(arena_bgr: UInt8Array, views: UInt8Array, caption: str) -> UInt8Array:
-    """One frame: the arena at left, the robots' views enlarged at right, the caption below.
+    """One frame: the arena on the left, the robots' views enlarged on the right, a caption below.
 
-    arena_bgr: uint8 [S, S, 3]. views: uint8 [K, V, V], grey. Returns uint8 BGR [H, W, 3] of
-    even size, the same for the same shapes.
+    arena_bgr: uint8 [S, S, 3]. views: uint8 [K, V, V], intensities. Returns uint8 BGR [H, W, 3] of
+    even size, equal for equal shapes.
     """
     size = arena_bgr.shape[0]
     panel = _panel(views, size)
@@ -133,7 +131,7 @@ def compose_frame(arena_bgr: UInt8Array, views: UInt8Array, caption: str) -> UIn
 
 
 def _panel(views: UInt8Array, height: int) -> UInt8Array:
-    """The views, as large as whole factors allow, in a grid with a label above each."""
+    """The views in a grid, enlarged by the largest whole factor, with a label above each."""
     num, side = views.shape[:2]
     columns, scale = _grid(num, side, height)
     large = side * scale
@@ -152,7 +150,7 @@ def _panel(views: UInt8Array, height: int) -> UInt8Array:
 
 
 def _grid(num: int, side: int, height: int) -> tuple[int, int]:
-    """Columns and whole factor with which the views are largest."""
+    """Number of columns and whole factor that make the views largest."""
 
     def scale(columns: int) -> int:
         rows = -(-num // columns)
@@ -170,7 +168,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 
 def _text(text: str, width: int, height: int, size: int) -> UInt8Array:
-    """Light words on the background, vertically centred; uint8 [height, width, 3]."""
+    """Light text on the background, vertically centred; uint8 [height, width, 3]."""
     image = Image.new("L", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(image)
     draw.text((GAP_PX // 2, height // 2), text, fill=235, font=_font(size), anchor="lm")

@@ -1,6 +1,6 @@
-"""The paper's images of any arena and run: Figs. 1, 3, 7 and 10 (Figs. 6 and 8: `figures`).
+"""The paper's figures for any arena and run: Figs. 1, 3, 7 and 10 (Figs. 6 and 8: `figures`).
 
-Invariants: drawn with matplotlib's Figure on Agg, no global state.
+Invariants: plotted with matplotlib's Figure on Agg, without global state.
 """
 
 from collections.abc import Sequence
@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mrcdrl.common.config import ArenaConfig
-from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.messages.trajectory import Evaluation, Float64Array, Outcome, UInt8Array
-from mrcdrl.services.monitor.records import read_episodes, read_evaluations
-from mrcdrl.services.plots.figures import DPI, HUNDRED, Path2D, draw_paths, dress, means, save, say
+from mrcdrl.services.monitor.records import SUCCESS_WINDOW, read_episodes, read_evaluations
+from mrcdrl.services.plots.figures import DPI, Path2D, draw_paths, dress, means, save, say
 
 SUFFIXES = (".png", ".svg")
 _COLOURS = ("#123c73", "#c4500a", "#2a7f3f", "#6a3d9a", "#b01050", "#0a7a80", "#8a7400", "#444444")
@@ -25,9 +24,9 @@ _COLOURS = ("#123c73", "#c4500a", "#2a7f3f", "#6a3d9a", "#b01050", "#0a7a80", "#
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What one robot sees of an arena, and where that lies in it."""
+    """What one robot sees of an arena, and where it lies there."""
 
-    grey: UInt8Array  # [S, S], the whole arena
+    arena: UInt8Array  # [S, S], intensities of the whole arena
     pose: Float64Array  # [3], x px, y px, heading rad, of the robot
     view: UInt8Array  # [V, V], its image
     states: UInt8Array  # [K, S, V, V], of all robots, oldest image first
@@ -42,7 +41,7 @@ class Contender:
 
 
 def arenas(images: Sequence[UInt8Array], titles: Sequence[str], out: Path) -> None:
-    """Arenas side by side (Fig. 1); images: BGR [S, S, 3]."""
+    """Plot arenas side by side (Fig. 1); images: BGR [S, S, 3]."""
     figure, panels = _panels(1, len(images), 3.6)
     for axes, image, title in zip(panels[0], images, titles, strict=True):
         axes.imshow(image[..., ::-1])
@@ -51,17 +50,17 @@ def arenas(images: Sequence[UInt8Array], titles: Sequence[str], out: Path) -> No
 
 
 def sight(seen: Sight, config: ArenaConfig, out: Path) -> None:
-    """How a robot's image comes about, and what each robot sees (Fig. 3).
+    """Plot how a robot's image is made, and what each robot sees (Fig. 3).
 
-    (a) the grey arena with the rectangle around one robot, zeros beyond the border; (b) that
-    rectangle resized; (c) the state of every robot, a row each, oldest image first.
+    (a) the arena's intensities with the rectangle around one robot, zeros beyond the border; (b)
+    that rectangle resized; (c) the state of every robot, one row each, oldest image first.
     """
     num, stack = seen.states.shape[:2]
     figure = Figure(figsize=(8.6 + 0.9 * stack, 4.4), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     widths = (4.3, 4.3, max(2, 0.9 * stack))
     left, middle, right = figure.subfigures(1, 3, squeeze=False, width_ratios=widths)[0]
-    _show_grey(left.subplots(), seen, config)
+    _show_window(left.subplots(), seen, config)
     axes = middle.subplots()
     axes.imshow(seen.view, cmap="gray", vmin=0, vmax=255)
     axes.set_title(f"(b) resized to {config.view_px} x {config.view_px}", fontsize=10)
@@ -76,7 +75,7 @@ def sight(seen: Sight, config: ArenaConfig, out: Path) -> None:
 
 
 def comparison(rows: Sequence[Contender], config: ArenaConfig, out: Path) -> None:
-    """Several policies from the same starts: a row each, a start a column (Fig. 10)."""
+    """Plot several policies from the same starts (Fig. 10): a row each, a column for each start."""
     figure, panels = _panels(len(rows), len(rows[0].episodes), 3.1)
     for row, contender in zip(panels, rows, strict=True):
         for axes, episode in zip(row, contender.episodes, strict=True):
@@ -89,9 +88,9 @@ def comparison(rows: Sequence[Contender], config: ArenaConfig, out: Path) -> Non
 
 
 def curves(run_dirs: Sequence[Path], out: Path) -> None:
-    """Successes of several runs over what they have learned (Figs. 7 g to i, and the test).
+    """Plot the successes of several runs over episodes (Figs. 7 g to i) and over learner steps.
 
-    Raises RunDirectoryError for records of another kind.
+    Raises RunDirectoryError for records of another version.
     """
     figure = Figure(figsize=(9, 7.5), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
@@ -101,7 +100,7 @@ def curves(run_dirs: Sequence[Path], out: Path) -> None:
     for number, run_dir in enumerate(run_dirs):
         colour = _COLOURS[number % len(_COLOURS)]
         won = [record.episode.outcome is Outcome.SUCCESS for record in read_episodes(run_dir)]
-        training.plot(*means(HUNDRED * np.array(won, float), HUNDRED), color=colour)
+        training.plot(*means(SUCCESS_WINDOW * np.array(won, float), SUCCESS_WINDOW), color=colour)
         tests = sorted((e.evaluation for e in read_evaluations(run_dir)), key=_learner_step)
         steps = [e.learner_step for e in tests]
         test.plot(steps, [100 * e.success_rate for e in tests], color=colour, label=run_dir.name)
@@ -116,25 +115,19 @@ def curves(run_dirs: Sequence[Path], out: Path) -> None:
     save(figure, out)
 
 
-def check_suffix(out: Path) -> None:
-    """Raises MrcdrlError unless it is one that can be drawn."""
-    if out.suffix not in SUFFIXES:
-        raise MrcdrlError(f"figure {out}: the name ends in none of {', '.join(SUFFIXES)}")
-
-
 def _learner_step(test: Evaluation) -> int:
     return test.learner_step
 
 
-def _show_grey(axes: Axes, seen: Sight, config: ArenaConfig) -> None:
-    """The arena in grey on black, and the rectangle, which may reach beyond it."""
+def _show_window(axes: Axes, seen: Sight, config: ArenaConfig) -> None:
+    """Plot the arena on black, and the rectangle, which may reach beyond it."""
     size, crop = config.size_px, config.crop_px
     x, y, heading = seen.pose
-    turned = np.degrees(heading) + 90 if config.orientation == "heading_up" else 0.0
-    axes.imshow(seen.grey, cmap="gray", vmin=0, vmax=255, extent=(0, size, size, 0))
+    turn_deg = np.degrees(heading) + 90 if config.orientation == "heading_up" else 0.0
+    axes.imshow(seen.arena, cmap="gray", vmin=0, vmax=255, extent=(0, size, size, 0))
     corner = (x - crop / 2, y - crop / 2)
     window = Rectangle(
-        corner, crop, crop, angle=turned, rotation_point="center",
+        corner, crop, crop, angle=turn_deg, rotation_point="center",
         fill=False, ec="#ff9020", lw=1.6, clip_on=False,
     )  # fmt: skip
     axes.add_patch(window)
@@ -142,11 +135,11 @@ def _show_grey(axes: Axes, seen: Sight, config: ArenaConfig) -> None:
     places = np.concatenate([window.get_corners(), [(0, 0), (size, size)]])
     (left, top), (right, bottom) = places.min(axis=0) - 4, places.max(axis=0) + 4
     axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], facecolor="black")
-    axes.set_title("(a) grey, zeros beyond the border", fontsize=10)
+    axes.set_title("(a) intensity, zeros beyond the border", fontsize=10)
 
 
 def _panels(rows: int, columns: int, side: float) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes [rows, columns], bare; side: inches of a panel."""
+    """A figure and its axes [rows, columns] without frames; side: a panel's, in inches."""
     figure = Figure(figsize=(side * columns, (side + 0.25) * rows), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False)

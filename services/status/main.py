@@ -1,4 +1,4 @@
-"""`mrcdrl status`: who is in a run that is up, how fast it goes, and what limits it."""
+"""`mrcdrl status`: the processes of a live run, its pace, and its bottleneck."""
 
 import json
 import math
@@ -11,27 +11,27 @@ from rich.console import Console
 from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.common.runtime.versions import PACKAGES
+from mrcdrl.common.runtime.versions import VERSIONED
 from mrcdrl.common.sync.joining import Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
-from mrcdrl.services.monitor.bottleneck import limiting_stage
+from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.display import display
 from mrcdrl.services.monitor.follower import Follower
 from mrcdrl.services.monitor.recorder import Recorder, flat_metrics
+from mrcdrl.services.monitor.records import finite
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.screen import screen
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
 
-VERSIONED = ("python", *PACKAGES)
 _TICK_S = 0.25
-_LISTEN_S = 3.0  # every service speaks once a second, and two words of it make a rate
+_LISTEN_S = 3.0  # every service reports once a second, and two reports make a rate
 _JSON_PERIOD_S = 1.0
 Show = Callable[[], None]
 
 
 def main(argv: Sequence[str]) -> int:
-    """Show, or keep the record, of a run; the exit code."""
+    """Show a run, or keep its records; the exit code."""
     arguments = parser().parse_args(argv)
     joining, stop = Joining.from_arguments(arguments), StopSignal().listen()
     with ExitStack() as owned:
@@ -53,22 +53,24 @@ def main(argv: Sequence[str]) -> int:
             if arguments.json
             else display(state, config, joining.run, lambda: follower.now)
         )
-        # Of a service only: who looks at one from within its container must not beat for it.
+        # Only a recorder is a service: status run in its container must not beat for it.
         heartbeat = Heartbeat.from_environment() if arguments.record else Heartbeat(None)
         with showing as show:
             listen(follower, heartbeat, stop, show)
         if recorder is not None:
-            recorder.write_summary(state, follower.now, "stopped by hand")
+            recorder.write_summary(state, follower.now, f"stopped ({stop.cause})")
     return 0
 
 
 def parser() -> Parser:
     """The command's flags."""
-    made = joining_parser("status", "What a run that is up does, and what limits it.")
-    made.add_argument("--watch", action="store_true", help="go on until told to stop")
+    made = joining_parser("status", "Show what a live run does, and its bottleneck.")
+    made.add_argument("--watch", action="store_true", help="keep showing it until stopped")
     made.add_argument("--json", action="store_true", help="as JSON, one object a line")
     made.add_argument(
-        "--record", action="store_true", help="go on, and write down what `mrcdrl train` would"
+        "--record",
+        action="store_true",
+        help="keep the records that `mrcdrl train` would, until stopped",
     )
     return made
 
@@ -80,7 +82,7 @@ def listen(
     show: Show,
     until_s: float = math.inf,
 ) -> None:
-    """Take in what the run says, and show it, until stopped or the time is over."""
+    """Follow the run and show it until stopped, or for `until_s` seconds."""
     beat_s = 0.0
     while not stop.is_set() and follower.lived_s < until_s:
         if follower.listen(_TICK_S):
@@ -92,7 +94,7 @@ def listen(
 
 
 def print_once(state: RunState, now: float, run: str, as_json: bool) -> None:
-    """The screen, or the JSON, of this moment."""
+    """Print the screen, or the JSON, of this moment."""
     console = Console()
     if as_json:
         console.out(json.dumps(status(state, now)), highlight=False)
@@ -102,7 +104,7 @@ def print_once(state: RunState, now: float, run: str, as_json: bool) -> None:
 
 @contextmanager
 def json_lines(state: RunState, clock: Callable[[], float]) -> Iterator[Show]:
-    """A function that prints the status as a line of JSON once a second."""
+    """Yield a function that prints the status as a line of JSON, at most once a second."""
     console, due_s = Console(), [0.0]
 
     def print_line() -> None:
@@ -114,16 +116,17 @@ def json_lines(state: RunState, clock: Callable[[], float]) -> Iterator[Show]:
 
 
 def status(state: RunState, now: float) -> dict[str, Any]:
-    """Who is there, what limits, and every figure that the record has of a second."""
+    """The processes, the bottleneck, and all that metrics.jsonl records of a second."""
     last = state.last_evaluation
-    return {
-        "limited_by": limiting_stage(state).replace("\N{NO-BREAK SPACE}", " "),
+    figures = flat_metrics(state, now).items()
+    values = {
+        "limited_by": bottleneck(state).replace("\N{NO-BREAK SPACE}", " "),
         "services": [
             {
                 "role": s.role,
                 "id": s.id,
                 "alive": s.alive,
-                "silent_s": finite(s.silent_s(now)),
+                "silent_s": round(s.silent_s(now), 6),
                 "slot": s.slot,
                 "versions": {name: s.text[name] for name in VERSIONED if name in s.text},
             }
@@ -133,10 +136,6 @@ def status(state: RunState, now: float) -> dict[str, Any]:
         "replay_capacity": state.replay_capacity,
         "success_rate": last.evaluation.success_rate if last else None,
         "evaluated_version": last.evaluation.weights_version if last else None,
-        **{name: finite(value) for name, value in flat_metrics(state, now).items()},
+        **{name: None if value is None else round(value, 6) for name, value in figures},
     }
-
-
-def finite(value: float | None) -> float | None:
-    """Null for what JSON has no number for."""
-    return None if value is None or not math.isfinite(value) else round(value, 6)
+    return {name: finite(value) for name, value in values.items()}

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-from mrcdrl.common.config import load_config, to_toml
+from mrcdrl.common.config import DEFAULT_PRESET, load_config, to_toml
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 
 
 def main(argv: Sequence[str]) -> int:
-    """Print it as TOML; the exit code."""
+    """Print it as TOML; return the exit code."""
     parser = Parser(prog="mrcdrl config", description="Print the resolved configuration.")
-    parser.add_argument("--config", default="quick", help="a preset or a TOML file")
+    parser.add_argument("--config", default=DEFAULT_PRESET, help="a preset or a TOML file")
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
     print(to_toml(load_config(arguments.config, overrides(arguments))))

@@ -1,8 +1,8 @@
-"""`mrcdrl figure`: the paper's images of any run, weights or controller.
+"""`mrcdrl figure`: plot the paper's figures of any run, weights or controller.
 
-`arena`: Fig. 1, a start. `views`: Fig. 3, how a robot's image comes about. `trajectories`:
-Fig. 8, episodes of one policy. `comparison`: Fig. 10, several policies from the same starts.
-`curves`: Fig. 7, successes of several runs over what they have learned.
+`arena`: Fig. 1, a start. `views`: Fig. 3, how a robot's image is made. `trajectories`: Fig. 8,
+episodes of one policy. `comparison`: Fig. 10, several policies from the same starts. `curves`:
+Fig. 7, successes of several runs over training.
 """
 
 import argparse
@@ -18,12 +18,12 @@ from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
 from mrcdrl.services.evaluator.trial import EpisodeResult, play
-from mrcdrl.services.plots.figures import Path2D, trajectories
+from mrcdrl.services.plots.figures import Path2D, check_suffix, trajectories
 from mrcdrl.services.plots.paper import (
+    SUFFIXES,
     Contender,
     Sight,
     arenas,
-    check_suffix,
     comparison,
     curves,
     sight,
@@ -37,8 +37,8 @@ from mrcdrl.services.tools.subject import (
 )
 
 _ARENA_PX = 900
-_GREY_WEIGHTS = (0.114, 0.587, 0.299)  # OpenCV's, of blue, green and red
-# What makes two arenas the same world; rewards and images may differ from policy to policy.
+_INTENSITY_WEIGHTS = (0.114, 0.587, 0.299)  # OpenCV's, for blue, green and red
+# Fields that must agree for a comparison; rewards and images may differ between policies.
 _WORLD = (
     "num_robots", "size_px", "wall_offset_px", "wall_thickness_px", "robot_radius_px",
     "target_size_px", "turn_deg", "step_px", "target_layout", "targets_px",
@@ -47,58 +47,68 @@ _WORLD = (
 
 
 def main(argv: Sequence[str]) -> int:
-    """Draw; the exit code."""
+    """Write the figure; return the exit code."""
     parser = _parser()
     arguments = parser.parse_args(argv)
     if arguments.episodes is not None and arguments.episodes < 1:
         parser.error(f"--episodes {arguments.episodes}: at least 1")
     if arguments.frame < 0:
         parser.error(f"--frame {arguments.frame}: at least 0")
-    check_suffix(arguments.out)
+    check_suffix(arguments.out, SUFFIXES)
     _FIGURES[arguments.figure](arguments)
     return 0
 
 
 def _parser() -> Parser:
     parser = Parser(prog="mrcdrl figure", description=__doc__)
-    parser.add_argument("figure", choices=list(_FIGURES), help="which")
-    parser.add_argument("weights", nargs="*", type=Path, help=".safetensors files, or runs")
+    parser.add_argument("figure", choices=list(_FIGURES), help="which figure")
+    parser.add_argument(
+        "weights", nargs="*", type=Path, help=".safetensors files or run directories"
+    )
     parser.add_argument("--out", type=Path, required=True, help="the .png or .svg to write")
     parser.add_argument(
-        "--controller", action="append", default=[], help="beside weights or instead of them"
+        "--controller",
+        action="append",
+        default=[],
+        help="in addition to weights, or instead of them",
     )
-    parser.add_argument("--episodes", type=int, help="episodes to show: 12, 4 to compare")
-    parser.add_argument("--frame", type=int, default=40, help="of the episode, for `views`")
-    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
+    parser.add_argument(
+        "--episodes", type=int, help="episodes to show; default: 12, or 4 to compare"
+    )
+    parser.add_argument("--frame", type=int, default=40, help="frame of the episode, for `views`")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the starts and the exploration"
+    )
     add_arena_flags(parser)
     return parser
 
 
 def _arena(arguments: argparse.Namespace) -> None:
-    """A test start of every arena that is named, or of --config's."""
+    """Draw a test start in the arena of each subject, or of --config if there is none."""
     named = [shown.config for shown in _subjects(arguments)]
     configs = [config.arena for config in named or [config_without_weights(arguments)]]
     images = []
     for config in configs:
         (start,) = test_starts(config, 1, arguments.seed)
-        scene = Scene(start.robots, start.targets)
+        scene = Scene(start.robots, start.targets, start.obstacles)
         images.append(render_arena(scene, config, _ARENA_PX, smooth=True))
     arenas(images, [f"{config.num_robots} robots" for config in configs], arguments.out)
 
 
 def _views(arguments: argparse.Namespace) -> None:
-    """Of the lowermost robot, as in the"""
+    """Show what the lowermost robot sees (Fig. 3)."""
     shown = _one(arguments)
     config = shown.config.arena
     (episode,) = _episodes(shown, 1, arguments.seed)
     frame = min(arguments.frame, episode.frames)
     before = range(frame - config.stack + 1, frame + 1)
-    scenes = [Scene(episode.robots[max(0, at)], episode.targets) for at in before]
+    targets, obstacles = episode.targets, episode.obstacles
+    scenes = [Scene(episode.robots[max(0, at)], targets, obstacles) for at in before]
     robot = int(scenes[-1].robots[:, 1].argmax())
     codec = make_codec(config)
     states = np.stack([codec.decode(codec.encode(scene)) for scene in scenes], axis=1)
     seen = Sight(
-        grey=_grey(scenes[-1], config),
+        arena=_intensities(scenes[-1], config),
         pose=scenes[-1].robots[robot],
         view=literal_views(scenes[-1], config)[robot],
         states=states,
@@ -113,7 +123,7 @@ def _trajectories(arguments: argparse.Namespace) -> None:
 
 
 def _comparison(arguments: argparse.Namespace) -> None:
-    """Names the field when the policies do not live in the same world (ConfigError)."""
+    """Compare policies; raise ConfigError, naming the field, if their arenas differ."""
     subjects = _subjects(arguments)
     if len(subjects) < 2:
         raise ConfigError("a comparison takes at least two weights or controllers")
@@ -121,7 +131,7 @@ def _comparison(arguments: argparse.Namespace) -> None:
     for other in subjects[1:]:
         for name in _WORLD:
             if getattr(other.config.arena, name) != getattr(world, name):
-                raise ConfigError(f"not the same arena: arena.{name} differs; set it by its flag")
+                raise ConfigError(f"different arenas: arena.{name} differs; set it by its flag")
     rows = []
     for name, shown in zip(_names(arguments), subjects, strict=True):
         episodes = _episodes(shown, arguments.episodes or 4, arguments.seed)
@@ -131,12 +141,12 @@ def _comparison(arguments: argparse.Namespace) -> None:
 
 
 def _curves(arguments: argparse.Namespace) -> None:
-    """Of what the runs have recorded; nothing is played."""
+    """Plot the records of runs; no episode is played."""
     if not arguments.weights or arguments.controller:
-        raise ConfigError("curves are drawn of runs: give their folders")
+        raise ConfigError("curves takes run directories only")
     for run_dir in arguments.weights:
         if not run_dir.is_dir():
-            raise RunDirectoryError(f"{run_dir} is no run's folder")
+            raise RunDirectoryError(f"{run_dir} is not a directory")
     curves(arguments.weights, arguments.out)
 
 
@@ -150,7 +160,7 @@ _FIGURES: dict[str, Callable[[argparse.Namespace], None]] = {
 
 
 def _subjects(arguments: argparse.Namespace) -> list[Subject]:
-    """Everything that is named, weights first; controllers play in the arena of the first."""
+    """The subjects named, weights first; controllers play in the arena of the first."""
     subjects = []
     for path in arguments.weights:
         alone = copy.copy(arguments)
@@ -179,6 +189,7 @@ def _paths(episodes: Sequence[EpisodeResult]) -> list[Path2D]:
     return [Path2D(e.robots, e.targets, e.obstacles, e.outcome) for e in episodes]
 
 
-def _grey(scene: Scene, config: ArenaConfig) -> UInt8Array:
-    grey: Float64Array = render_arena(scene, config, config.size_px) @ np.array(_GREY_WEIGHTS)
-    return np.rint(grey).astype(np.uint8)
+def _intensities(scene: Scene, config: ArenaConfig) -> UInt8Array:
+    image = render_arena(scene, config, config.size_px)
+    intensities: Float64Array = image @ np.array(_INTENSITY_WEIGHTS)
+    return np.rint(intensities).astype(np.uint8)

@@ -1,7 +1,7 @@
-"""The processes of a run on this machine: started, watched, started again, stopped in order.
+"""The processes of a run on this machine: started, watched, restarted, stopped in order.
 
-Invariants: every process started here has ended when `stop` returns; services get a session of
-their own, so that Ctrl-C reaches the launcher only; they end with it, however it ends.
+Invariants: every process started here has ended when `stop` returns. Each runs in its own session,
+so that Ctrl-C reaches the launcher only, and ends with the launcher, however that ends.
 """
 
 import logging
@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from mrcdrl.common.config import ENV_PREFIX
@@ -18,31 +18,31 @@ from mrcdrl.common.errors import DivergedError, MrcdrlError
 from mrcdrl.common.runtime.process import ALLOCATOR, COMMAND, DIE_WITH_PARENT
 
 _LOG = logging.getLogger("train")
-_TERM_S = 20.0  # until a service that was asked to stop is killed
-_MIN_LIFE_S = 10.0  # a service that fails sooner would fail again
-_LONG_LIFE_S = 300.0  # one that lived so long may be started again as often as at first
+_TERM_S = 20.0  # a process that was asked to stop is killed after this
+_MIN_LIFE_S = 10.0  # a process that fails sooner would fail again
+_LONG_LIFE_S = 300.0  # a process that lived this long gets all its restarts back
 _MAX_RESTARTS = 3
 _STOP_ORDER = ("actor", "evaluator", "learner", "replay", "router")
 
 
 @dataclass(slots=True)
-class Service:
-    """One service's command and the process that runs it now."""
+class ManagedProcess:
+    """A service's command, and the process that runs it now."""
 
     role: str
     worker: str
     arguments: list[str]
     log_path: Path
-    process: subprocess.Popen[bytes] | None = None
+    popen: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
     restarts: int = 0
-    log_read: int = field(default=0)
+    log_read: int = 0  # bytes of the log searched for warnings
 
     def start(self) -> None:
         command = [*COMMAND, self.role, *self.arguments]
         environment = {**ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: str(os.getpid())}
         with self.log_path.open("ab") as log:
-            self.process = subprocess.Popen(
+            self.popen = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -53,102 +53,102 @@ class Service:
         self.started_s = time.monotonic()
 
     def last_line(self) -> str:
-        """The last line of its log, usually the reason it ended."""
+        """The last line of its log, usually the reason for its end."""
         lines = self.log_path.read_text("utf-8", "replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "its log is empty"
 
 
 class Fleet:
-    """All services of a run."""
+    """All processes of a run."""
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
-        self._services: list[Service] = []
+        self._processes: list[ManagedProcess] = []
 
     def start(self, role: str, worker: str, arguments: list[str]) -> None:
-        service = Service(role, worker, arguments, self._logs / f"{worker}.log")
-        if service.log_path.exists():
-            service.log_read = service.log_path.stat().st_size
-        self._services.append(service)
-        service.start()
+        process = ManagedProcess(role, worker, arguments, self._logs / f"{worker}.log")
+        if process.log_path.exists():
+            process.log_read = process.log_path.stat().st_size
+        self._processes.append(process)
+        process.start()
 
     def watch(self) -> str | None:
-        """Start again what crashed; why the run must end, if it must.
+        """Restart what crashed; the reason to end the run, if there is one.
 
-        Raises MrcdrlError where a service fails right after its start, or again and again, or
-        where learning diverged.
+        Raises MrcdrlError if a process fails right after its start or repeatedly, or if learning
+        diverged.
         """
-        for service in self._services:
-            code = None if service.process is None else service.process.poll()
+        for process in self._processes:
+            code = None if process.popen is None else process.popen.poll()
             if code is None:
                 continue
-            service.process = None
-            lived_s = time.monotonic() - service.started_s
+            process.popen = None
+            lived_s = time.monotonic() - process.started_s
             if lived_s > _LONG_LIFE_S:
-                service.restarts = 0
+                process.restarts = 0
             if code == 0:
-                if service.role == "learner":
-                    return "the learner has done its steps"
+                if process.role == "learner":
+                    return "the learner has finished its steps"
                 _LOG.warning(
-                    "%s was stopped by hand; mrcdrl %s --run %s --id %s starts one again",
-                    *(service.worker, service.role, self._logs.parent.name, service.worker),
+                    "%s was stopped; restart it with mrcdrl %s --run %s --id %s",
+                    *(process.worker, process.role, self._logs.parent.name, process.worker),
                 )
             elif (
                 lived_s < _MIN_LIFE_S
-                or service.restarts == _MAX_RESTARTS
+                or process.restarts == _MAX_RESTARTS
                 or code == DivergedError.exit_code
             ):
                 raise MrcdrlError(
-                    f"{service.worker} failed: {service.last_line()} (log: {service.log_path})"
+                    f"{process.worker} failed: {process.last_line()} (log: {process.log_path})"
                 )
             else:
-                _LOG.warning("%s ended with code %d; starting it again", service.worker, code)
-                service.restarts += 1
-                service.start()
+                _LOG.warning("%s ended with code %d; restarting it", process.worker, code)
+                process.restarts += 1
+                process.start()
         return None
 
     def warnings(self) -> Iterator[str]:
-        """Warnings and errors that services logged since the last call."""
-        for service in self._services:
-            with service.log_path.open("rb") as log:
-                log.seek(service.log_read)
+        """Warnings and errors logged since the last call."""
+        for process in self._processes:
+            with process.log_path.open("rb") as log:
+                log.seek(process.log_read)
                 text = log.read()
             whole = text[: text.rfind(b"\n") + 1]
-            service.log_read += len(whole)
+            process.log_read += len(whole)
             for line in whole.decode("utf-8", "replace").splitlines():
                 if " WARNING " in line or " ERROR " in line:
-                    yield f"{service.worker}: {line.split(': ', 1)[-1]}"
+                    yield f"{process.worker}: {line.split(': ', 1)[-1]}"
 
     def stop(self) -> None:
-        """Stop role after role, those that feed before those that are fed."""
+        """Stop the roles in order, producers before their consumers."""
         for role in _STOP_ORDER:
-            stopping = [s for s in self._services if s.role == role and s.process is not None]
-            for service in stopping:
-                self._signal(service, signal.SIGTERM)
-            for service in stopping:
-                self._await(service)
+            stopping = [p for p in self._processes if p.role == role and p.popen is not None]
+            for process in stopping:
+                self._signal(process, signal.SIGTERM)
+            for process in stopping:
+                self._await(process)
 
-    def _await(self, service: Service) -> None:
-        if service.process is None:
+    def _await(self, process: ManagedProcess) -> None:
+        if process.popen is None:
             return
         try:
-            code = service.process.wait(_TERM_S)
+            code = process.popen.wait(_TERM_S)
         except subprocess.TimeoutExpired:
-            _LOG.warning("%s did not stop within %g s and was killed", service.worker, _TERM_S)
-            self._signal(service, signal.SIGKILL)
-            code = service.process.wait()
+            _LOG.warning("%s did not stop within %g s and was killed", process.worker, _TERM_S)
+            self._signal(process, signal.SIGKILL)
+            code = process.popen.wait()
         if code not in (0, -signal.SIGKILL):
-            _LOG.warning("%s ended with code %d: %s", service.worker, code, service.last_line())
-        service.process = None
+            _LOG.warning("%s ended with code %d: %s", process.worker, code, process.last_line())
+        process.popen = None
 
-    def _signal(self, service: Service, number: int) -> None:
-        if service.process is not None and service.process.poll() is None:
-            service.process.send_signal(number)
+    def _signal(self, process: ManagedProcess, number: int) -> None:
+        if process.popen is not None and process.popen.poll() is None:
+            process.popen.send_signal(number)
 
 
 def resolved_environment() -> dict[str, str]:
-    """This process's environment without settings: they are in the run's config.toml already,
-    where a flag may have overruled them."""
+    """This process's environment without settings: the run's config.toml holds them already, and
+    a flag may have overridden them."""
     return {
         name: value
         for name, value in os.environ.items()

@@ -136,7 +136,7 @@ def test_a_second_launcher_is_refused_while_the_run_is_up(live: Live) -> None:
     arguments = ["train", "--resume", live.name, "--run-dir", live.folder]
     with Command(arguments, live.folder) as second:
         assert second.wait() == 1
-    assert "in use by a run that is up" in error_line(second.err)
+    assert "in use by another process" in error_line(second.err)
     assert live.train.process.poll() is None
 
 

@@ -66,7 +66,7 @@ def test_a_run_ends_by_itself_and_prints_plain_lines(finished: Finished) -> None
         assert re.match(r"\d+:\d\d:\d\d  .*robot steps \d+ .*replay \d+/20000  learner steps", line)
     assert "\x1b" not in finished.out
     assert "Traceback" not in finished.err
-    assert "run.learner_steps 60 done" in finished.err
+    assert "learner step limit reached (60)" in finished.err
 
 
 def test_nothing_of_a_finished_run_is_left_behind(finished: Finished) -> None:

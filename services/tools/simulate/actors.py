@@ -21,6 +21,7 @@ import numpy as np
 
 from mrcdrl.common.config import Config, TransportConfig
 from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.messages.metrics import ActorMetrics, read
 from mrcdrl.common.messages.trajectory import (
     NO_SLOT,
     NUM_ACTIONS,
@@ -45,6 +46,7 @@ _EPISODES = 8  # different ones; then they come again
 _TICK_S = 0.01
 _TELL_S = 1.0
 BEGIN, STOP = "begin", "stop"
+_NOT_SIMULATED = read(ActorMetrics, {})  # 0 for every metric
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +180,7 @@ class SimulatedActor:
         if weights is not None:
             self.counts.update(weights=1, weights_bytes=len(weights))
         self._peers.alive()
-        self._reporter.maybe(self._said)
+        self._reporter.maybe(self._metrics)
 
     def _spool(self, now_s: float) -> bool:
         chunk = replace(
@@ -213,24 +215,16 @@ class SimulatedActor:
             mean_q=0.0,
         )
 
-    def _said(self) -> dict[str, float]:
-        """Every name that an actor tells; 0 for what is not simulated."""
-        told = {
-            "robot_steps": self._made,
-            "episodes": self._episodes,
-            "chunks": self.sender.chunks,
-            "inserts_acknowledged": self.sender.transitions,
-            "spool_chunks": self.sender.spooled,
-            "slot": NO_SLOT,
-        }
-        return dict.fromkeys(NOT_SIMULATED, 0.0) | told
-
-
-NOT_SIMULATED = (
-    *("env_steps", "weights_version", "weights_age_s", "weights_refused"),
-    *("epsilon_min", "epsilon_max", "inference_share", "arena_share", "draw_share"),
-    *("chunk_share", "wait_share"),
-)
+    def _metrics(self) -> ActorMetrics:
+        return replace(
+            _NOT_SIMULATED,
+            robot_steps=self._made,
+            episodes=self._episodes,
+            chunks=self.sender.chunks,
+            inserts_acknowledged=self.sender.transitions,
+            spool_chunks=self.sender.spooled,
+            slot=NO_SLOT,
+        )
 
 
 class SimulatedActors:

@@ -13,12 +13,13 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 
-from mrcdrl.common.config import load_config
+from mrcdrl.common.config import DEFAULT_PRESET, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import StopSignal, available_cores
-from mrcdrl.services.monitor.summary import machine, versions
+from mrcdrl.common.runtime.versions import all_versions
+from mrcdrl.services.monitor.summary import machine
 from mrcdrl.services.tools.simulate.simulation import Demand, simulation
 from mrcdrl.services.tools.simulate.target import NAME, joined, own
 
@@ -34,11 +35,12 @@ def main(argv: Sequence[str]) -> int:
     stop = StopSignal().listen()
     demand = Demand(arguments.actors, arguments.rate, arguments.processes, arguments.publications)
     given = overrides(arguments)
+    preset = arguments.config or DEFAULT_PRESET
     with ExitStack() as owned:
         target = owned.enter_context(
             joined(arguments.run, arguments.connect, given, stop)
             if arguments.connect
-            else own(load_config(arguments.config or "quick", given), router=arguments.router)
+            else own(load_config(preset, given), router=arguments.router)
         )
         simulated = owned.enter_context(simulation(demand, target, f"simulated-{os.getpid()}"))
         figures = simulated.run(60 * arguments.minutes, stop)
@@ -47,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
         "actors": demand.actors,
         **figures,
         "machine": machine(),
-        "versions": versions(),
+        "versions": all_versions(),
     }
     sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
     return 0
@@ -69,7 +71,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         "--publications", type=_frequency, help="of weights per second; by default 1"
     )
     parser.add_argument("--router", action="store_true", help="put one before replay")
-    parser.add_argument("--config", help="a preset or a TOML file; by default quick")
+    parser.add_argument("--config", help=f"a preset or a TOML file; by default {DEFAULT_PRESET}")
     parser.add_argument("--run", help=f"join this run instead; its name begins with {NAME}")
     parser.add_argument("--connect", help="where it is, such as tcp/127.0.0.1:7447")
     parser.add_argument(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from mrcdrl.common.config import Config
+from mrcdrl.common.messages.metrics import ActorMetrics, kinds
 from mrcdrl.common.messages.trajectory import (
     Chunk,
     EpisodeSummary,
@@ -30,7 +31,7 @@ from mrcdrl.common.messages.trajectory import (
 from mrcdrl.common.messages.wire import encode_parts
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import SENT_AS, weights_to_bytes
-from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, NOT_SIMULATED, episode_chunks
+from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
 
 # Processor seconds of replay's process, Zenoh's threads in it included, for
 INSERT_S = 0.36e-3  # a request to insert
@@ -245,10 +246,8 @@ def _samples(config: Config, size: int) -> Samples:
 
 
 def _stats() -> Stats:
-    told = {"robot_steps", "episodes", "chunks", "inserts_acknowledged", "spool_chunks"}
-    return Stats(
-        "actor", "actor-100", dict.fromkeys([*told, *NOT_SIMULATED], 1.0), {"incarnation": "1" * 19}
-    )
+    metrics = dict.fromkeys(kinds(ActorMetrics), 1.0)
+    return Stats("actor", "actor-100", metrics, {"incarnation": "1" * 19})
 
 
 def _episode() -> EpisodeSummary:

@@ -1,4 +1,4 @@
-"""The launcher's log lines while its screen is up."""
+"""Log lines of the process while its screen is up."""
 
 import logging
 
@@ -19,7 +19,7 @@ def test_log_lines_go_to_the_state_and_not_over_the_screen(
     assert capsys.readouterr().err == ""
 
 
-def test_log_lines_take_their_old_way_after_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_log_lines_are_written_as_before_after_it(caplog: pytest.LogCaptureFixture) -> None:
     state = RunState(Config())
     with logging_to(state):
         pass

@@ -1,4 +1,4 @@
-"""What a run leaves behind, and how it is taken up again."""
+"""The records of a run, and how they are resumed."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def evaluation(rate: float, step: int) -> Evaluation:
 
 
 def record(run_dir: Path, episodes: range, rates: list[float], start_s: float = 0.0) -> RunState:
-    """Records a stretch of a run as the dashboard does."""
+    """Record part of a run as the launcher does."""
     state = RunState(CONFIG)
     with Recorder(run_dir, CONFIG) as recorder:
         recorder.restore(state, StoppingRule(CONFIG.run))
@@ -48,7 +48,7 @@ def record(run_dir: Path, episodes: range, rates: list[float], start_s: float = 
         for k, rate in enumerate(rates):
             judged = evaluation(rate, 1_000 * (k + 1))
             recorder.record_evaluation(state.observe_evaluation(judged, start_s + 10 * k))
-        recorder.write_summary(state, start_s + 60, "run.minutes 1 over")
+        recorder.write_summary(state, start_s + 60, "time limit reached (1 min)")
     return state
 
 
@@ -134,7 +134,7 @@ def test_a_foreign_line_and_a_directory_that_cannot_be_written_are_refused(tmp_p
 def test_summary(tmp_path: Path) -> None:
     record(tmp_path, range(250), [0.4, 0.85, 0.95, 0.91])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["stop_reason"] == "run.minutes 1 over"
+    assert summary["stop_reason"] == "time limit reached (1 min)"
     assert summary["wall_s"] == 60
     assert (summary["env_steps"], summary["robot_steps"], summary["learner_steps"]) == (20, 40, 5)
     assert {"inserts", "samples", "weights_version"} <= summary.keys()

@@ -1,4 +1,4 @@
-"""A run's folder is taken by one process, and what is wrong with it is one line."""
+"""A run directory is held by one process, and each of its errors is one line."""
 
 import threading
 from pathlib import Path
@@ -18,7 +18,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "runs" / "first"
 
 
-def test_a_new_folder_holds_the_resolved_configuration(path: Path) -> None:
+def test_a_new_directory_holds_the_resolved_configuration(path: Path) -> None:
     with RunDirectory.create(path, CONFIG) as run:
         assert load_config(str(path / RUN_CONFIG), environ={}) == run.config == CONFIG
         assert run.logs.is_dir()
@@ -29,7 +29,7 @@ def test_a_new_folder_holds_the_resolved_configuration(path: Path) -> None:
     assert {entry.name for entry in path.iterdir()} == {RUN_CONFIG, "logs"}
 
 
-def test_a_folder_that_exists_is_no_new_run(path: Path) -> None:
+def test_a_directory_that_exists_is_not_a_new_run(path: Path) -> None:
     path.mkdir(parents=True)
     (path / "mine.txt").write_text("mine")
     with pytest.raises(
@@ -49,10 +49,10 @@ def test_a_run_is_resumed_with_what_the_flags_change(path: Path) -> None:
 
 
 @pytest.mark.parametrize("made", [False, True])
-def test_what_holds_no_run_is_not_resumed(path: Path, made: bool) -> None:
+def test_what_is_not_a_run_is_not_resumed(path: Path, made: bool) -> None:
     if made:
         path.mkdir(parents=True)
-    with pytest.raises(RunDirectoryError, match="holds no run"):
+    with pytest.raises(RunDirectoryError, match="is not a run"):
         RunDirectory.resume(path, {})
 
 
@@ -66,7 +66,7 @@ def test_a_run_whose_configuration_is_broken_is_not_resumed(path: Path) -> None:
 def test_a_run_that_is_up_is_not_resumed(path: Path) -> None:
     with (
         RunDirectory.create(path, CONFIG),
-        pytest.raises(RunDirectoryError, match="in use by a run that is up"),
+        pytest.raises(RunDirectoryError, match="in use by another process"),
     ):
         RunDirectory.resume(path, {})
     RunDirectory.resume(path, {}).close()
@@ -92,9 +92,9 @@ def test_of_many_that_resume_at_once_one_does(path: Path) -> None:
     taken[0].close()
 
 
-def test_a_file_in_place_of_a_folder_is_one_line(tmp_path: Path) -> None:
+def test_a_file_in_place_of_a_directory_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file")
-    with pytest.raises(RunDirectoryError, match=r"cannot make .*Not a directory") as refused:
+    with pytest.raises(RunDirectoryError, match=r"cannot create .*Not a directory") as refused:
         RunDirectory.create(tmp_path / "runs" / "first", CONFIG)
     assert "\n" not in str(refused.value)
 
@@ -108,7 +108,7 @@ def test_a_file_in_place_of_the_logs_is_one_line(path: Path) -> None:
 
 
 @pytest.mark.parametrize("config", ["quick", "some/where/quick.toml"])
-def test_a_name_is_made_of_preset_robots_and_time(config: str) -> None:
+def test_the_default_name_is_made_of_preset_robots_and_time(config: str) -> None:
     assert default_name(config, 3).startswith("quick-3robots-2")
 
 

@@ -1,10 +1,10 @@
-"""RunState folds messages; the limiting stage is read from it."""
+"""RunState folds messages; the bottleneck is read from it."""
 
 import pytest
 
 from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
-from mrcdrl.services.monitor.bottleneck import limiting_stage
+from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.recorder import flat_metrics
 from mrcdrl.services.monitor.state import RunState
 
@@ -86,7 +86,7 @@ def test_what_earlier_processes_collected_is_added() -> None:
     assert (state.env_steps, state.robot_steps) == (1_005, 2_010)
 
 
-def test_the_learners_step_is_known_before_it_is_heard_of_again() -> None:
+def test_the_learners_step_is_known_before_it_reports_again() -> None:
     state = RunState(config())
     state.restore_counted(0, 0, 700)
     assert state.learner_steps == 700
@@ -94,7 +94,7 @@ def test_the_learners_step_is_known_before_it_is_heard_of_again() -> None:
     assert state.learner_steps == 650
 
 
-def test_an_actor_that_outlived_who_kept_the_record_is_not_counted_twice() -> None:
+def test_an_actor_that_outlived_the_recorder_is_not_counted_twice() -> None:
     state = RunState(config())
     state.restore_counted(1_000, 2_000, 0, {("0", "env_steps"): 400, ("1", "env_steps"): 600})
     state.observe_stats(Stats("actor", "0", {"env_steps": 450}, {}), 0)
@@ -129,7 +129,7 @@ def test_the_best_evaluation_is_the_first_of_the_highest() -> None:
     assert state.last_evaluation.evaluation.success_rate == 0.5
 
 
-def test_staleness_epsilon_and_presence_follow_the_actors_that_are_there() -> None:
+def test_staleness_epsilon_and_presence_follow_the_actors_that_are_up() -> None:
     state = RunState(config())
     state.observe_stats(learner(10, weights_version=30), 0)
     state.observe_stats(
@@ -150,7 +150,7 @@ def test_staleness_epsilon_and_presence_follow_the_actors_that_are_there() -> No
 def test_an_actors_staleness_is_spread_over_its_last_ten_minutes() -> None:
     state = RunState(config())
     state.observe_stats(actor(1, "early", weights_version=0, weights_age_s=1.0), 0)
-    assert state.staleness_spreads == {}, "no learner has been heard of"
+    assert state.staleness_spreads == {}, "no learner has reported"
     for second in range(1000):
         state.observe_stats(learner(10, weights_version=5000), second)
         behind = 50 if second == 990 else 1000 if second < 400 else second % 2
@@ -185,28 +185,28 @@ FREE = {"sample_held": 0.0, "insert_held": 0.0, "size": 9_000}
     ("table", "shares", "waits", "expected"),
     [
         ({"size": 3_200}, {}, {}, "waiting for replay to fill (3 200 of 5 000)"),
-        (HELD_BY_ACTORS, {"inference_share": 0.6}, {}, "collection: actors' inference"),
-        (HELD_BY_ACTORS, {"arena_share": 0.6}, {}, "collection: actors' arenas"),
-        (HELD_BY_ACTORS, {"wait_share": 0.6}, {}, "the way from the actors to replay"),
-        (HELD_BY_LEARNER, {}, {"step_share": 0.9}, "the learner's computation"),
-        (HELD_BY_LEARNER, {}, {"decode_share": 0.9}, "the learner's decoding of batches"),
-        (FREE, {"draw_share": 0.6}, {"data_wait_share": 0.8}, "actors' drawing of images"),
-        (FREE, {}, {"data_wait_share": 0.3, "step_share": 0.6}, "the learner's computation"),
+        (HELD_BY_ACTORS, {"inference_share": 0.6}, {}, "collection: actor inference"),
+        (HELD_BY_ACTORS, {"arena_share": 0.6}, {}, "collection: arenas"),
+        (HELD_BY_ACTORS, {"wait_share": 0.6}, {}, "actors → replay transfer"),
+        (HELD_BY_LEARNER, {}, {"step_share": 0.9}, "learner computation"),
+        (HELD_BY_LEARNER, {}, {"decode_share": 0.9}, "learner decoding of batches"),
+        (FREE, {"draw_share": 0.6}, {"data_wait_share": 0.8}, "collection: rendering"),
+        (FREE, {}, {"data_wait_share": 0.3, "step_share": 0.6}, "learner computation"),
     ],
 )
-def test_the_limiting_stage_is_named(
+def test_the_bottleneck_is_named(
     table: dict[str, float], shares: dict[str, float], waits: dict[str, float], expected: str
 ) -> None:
     state = RunState(config())
     state.observe_stats(actor(1, **shares), 0)
     state.observe_stats(learner(1, **waits), 0)
     state.observe_stats(replay(**table), 0)
-    assert expected in limiting_stage(state).replace("\N{NO-BREAK SPACE}", " ")
+    assert expected in bottleneck(state).replace("\N{NO-BREAK SPACE}", " ")
 
 
-def test_a_missing_role_is_what_is_waited_for() -> None:
+def test_the_run_waits_for_a_missing_role() -> None:
     state = RunState(config())
-    assert limiting_stage(state) == "waiting for replay to be there"
+    assert bottleneck(state) == "waiting for replay to start"
     state.observe_stats(replay(size=0), 0)
     state.observe_stats(actor(1), 0)
-    assert limiting_stage(state) == "waiting for the learner to be there"
+    assert bottleneck(state) == "waiting for the learner to start"

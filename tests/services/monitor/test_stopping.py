@@ -1,4 +1,4 @@
-"""The stop rules, as a table of runs."""
+"""The stopping rule, as tables of runs."""
 
 import pytest
 
@@ -20,7 +20,7 @@ def evaluation(rate: float) -> Evaluation:
 
 
 def stopped_after(run: RunConfig, outcomes: list[Outcome]) -> int | None:
-    """Episodes after which the rule first speaks."""
+    """Episodes after which the rule first gives a reason."""
     rule = StoppingRule(run)
     for count, outcome in enumerate(outcomes, 1):
         rule.observe_episode(episode(outcome))
@@ -53,9 +53,9 @@ def test_patience(
     ("run", "steps", "minutes", "rates", "expected"),
     [
         (RunConfig(minutes=10), 0, 9.9, [], None),
-        (RunConfig(minutes=10), 0, 10.0, [], "run.minutes 10 over"),
+        (RunConfig(minutes=10), 0, 10.0, [], "time limit reached (10 min)"),
         (RunConfig(learner_steps=500), 499, 0.0, [], None),
-        (RunConfig(learner_steps=500), 500, 0.0, [], "run.learner_steps 500 done"),
+        (RunConfig(learner_steps=500), 500, 0.0, [], "learner step limit reached (500)"),
         (RunConfig(target_success_rate=0.9), 0, 0.0, [0.5, 0.89], None),
         (RunConfig(target_success_rate=0.9), 0, 0.0, [0.92, 0.5], "success 0.920 reached"),
         (RunConfig(), 10**9, 1e9, [1.0], None),

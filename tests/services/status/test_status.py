@@ -1,4 +1,4 @@
-"""`mrcdrl status`: what it says of a run, and whose folder it takes."""
+"""`mrcdrl status`: what it shows of a run, and how it locks the run directory."""
 
 import json
 from pathlib import Path
@@ -21,14 +21,14 @@ from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.status.main import listen, status
 
 
-def test_of_nobody() -> None:
+def test_status_without_processes() -> None:
     said = status(RunState(Config()), 0.0)
-    assert said["limited_by"] == "waiting for replay to be there"
+    assert said["limited_by"] == "waiting for replay to start"
     assert said["services"] == []
     json.dumps(said, allow_nan=False)
 
 
-def test_of_a_service_that_fell_silent() -> None:
+def test_status_of_a_silent_service() -> None:
     state = RunState(Config())
     state.observe_presence("replay", "replay-0", True)
     metrics = {"robot_steps": 10.0, "loss": float("nan"), "slot": 3.0}
@@ -46,7 +46,7 @@ def test_of_a_service_that_fell_silent() -> None:
     json.dumps(status(state, 9.0), allow_nan=False)
 
 
-def test_what_services_say_is_heard_and_is_work(tmp_path: Path) -> None:
+def test_statistics_are_received_and_count_as_work(tmp_path: Path) -> None:
     keys, path = Keys("heard"), tmp_path / "heartbeat"
     heartbeat, stop = Heartbeat(path), StopSignal()
     with Session(TransportConfig(listen=(free_endpoint(),))) as session:

@@ -9,6 +9,7 @@ import pytest
 
 from mrcdrl.common.config import TransportConfig, load_config, to_toml
 from mrcdrl.common.errors import EndpointError
+from mrcdrl.common.messages.metrics import EvaluatorMetrics
 from mrcdrl.common.runtime.versions import versions
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session, free_endpoint
@@ -17,6 +18,7 @@ from mrcdrl.services.tools.doctor.main import main
 from mrcdrl.services.tools.doctor.run import clocks, endpoints, same_versions, services
 
 RUN = "looked-at"
+IDLE = EvaluatorMetrics(evaluations=0, weights_version=0, busy=0)
 
 
 class Run:
@@ -44,7 +46,7 @@ class Run:
             if request is not None:
                 request.reply(self._text)
             for reporter in list(self._reporters):
-                reporter.now(dict)
+                reporter.now(lambda: IDLE)
 
     def close(self) -> None:
         self._stopping.set()

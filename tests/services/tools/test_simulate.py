@@ -10,11 +10,10 @@ import pytest
 
 from mrcdrl.common.config import load_config
 from mrcdrl.common.errors import ConfigError
-from mrcdrl.services.replay.build import build
-from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, NOT_SIMULATED, episode_chunks
+from mrcdrl.services.replay.table import Table
+from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
 from mrcdrl.services.tools.simulate.load import Load, Share, Usage, busy_cores, first_limit, latency
 from mrcdrl.services.tools.simulate.main import _allow_open_files, main
-from tests.test_docs import published
 
 
 @pytest.mark.parametrize(
@@ -27,7 +26,7 @@ from tests.test_docs import published
 )
 def test_chunks_are_those_of_whole_episodes(settings: dict[str, str], priorities: int) -> None:
     config = load_config("quick", {**settings, "replay.capacity": "6000"}, environ={})
-    table, _ = build(config)
+    table = Table.from_config(config)
     chunks = episode_chunks(config)
     for chunk in chunks:
         table.check(chunk)
@@ -36,19 +35,6 @@ def test_chunks_are_those_of_whole_episodes(settings: dict[str, str], priorities
     full, rest = divmod(EPISODE_FRAMES, length)
     assert Counter(map(len, chunks)) == {length: 8 * full, rest: 8}
     assert sum((chunk.discounts == 0).any() for chunk in chunks) == 8
-
-
-def test_every_metric_of_an_actor_is_told() -> None:
-    simulated = {
-        "robot_steps",
-        "episodes",
-        "chunks",
-        "inserts_acknowledged",
-        "spool_chunks",
-        "slot",
-    }
-    assert simulated | set(NOT_SIMULATED) == published("actor")
-    assert not simulated & set(NOT_SIMULATED)
 
 
 # -- limits ------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The fleet with real processes: small ones, in place of the services' modules."""
+"""The fleet with real processes: small ones in place of the services."""
 
 import os
 import signal
@@ -23,14 +23,14 @@ open(os.environ["READY"], "w").write(str(os.getpid()))
 while True:
     signal.pause()
 """
-_DEAF = _WAITS.replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
+_IGNORES = _WAITS.replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
 _FAILS = "import sys; sys.exit('mrcdrl: no such arena')"
 _ENDS = ""
 
 
 @pytest.fixture
 def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder that processes are started in; its `ready` is a pipe that they write to."""
+    """The directory that processes start in; they write to its pipe `ready`."""
     monkeypatch.chdir(tmp_path)
     os.mkfifo(tmp_path / "ready")
     monkeypatch.setenv("READY", str(tmp_path / "ready"))
@@ -53,7 +53,7 @@ def put(beside: Path, role: str, code: str) -> None:
 
 
 def ready(beside: Path) -> int:
-    """Wait until a process is up; its id."""
+    """Wait until a process is up; return its id."""
     with (beside / "ready").open() as pipe:
         return int(pipe.read())
 
@@ -68,14 +68,14 @@ def ended(pid: int) -> bool:
 
 
 def watch_until_ended(fleet: Fleet) -> str | None:
-    """`watch`, once the only service has ended; it stays to be reaped until then."""
-    (service,) = fleet._services
-    assert service.process is not None
-    os.waitid(os.P_PID, service.process.pid, os.WEXITED | os.WNOWAIT)
+    """Wait until the only process has ended, without reaping it, and call `watch`."""
+    (process,) = fleet._processes
+    assert process.popen is not None
+    os.waitid(os.P_PID, process.popen.pid, os.WEXITED | os.WNOWAIT)
     return fleet.watch()
 
 
-def test_services_run_and_have_ended_when_stop_returns(beside: Path, fleet: Fleet) -> None:
+def test_processes_run_and_have_ended_when_stop_returns(beside: Path, fleet: Fleet) -> None:
     for role in ("actor", "replay"):
         put(beside, role, _WAITS)
     pids = []
@@ -91,15 +91,15 @@ def test_services_run_and_have_ended_when_stop_returns(beside: Path, fleet: Flee
     fleet.stop()  # again is harmless
 
 
-def test_who_feeds_is_stopped_before_who_is_fed(
+def test_producers_are_stopped_before_their_consumers(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
     await_ended = Fleet._await
 
-    def watched(self: Fleet, service: fleet_module.Service) -> None:
-        await_ended(self, service)
-        order.append(service.role)
+    def watched(self: Fleet, process: fleet_module.ManagedProcess) -> None:
+        await_ended(self, process)
+        order.append(process.role)
 
     monkeypatch.setattr(Fleet, "_await", watched)
     for role in ("replay", "learner", "actor"):
@@ -110,18 +110,18 @@ def test_who_feeds_is_stopped_before_who_is_fed(
     assert order == ["actor", "learner", "replay"]
 
 
-def test_a_service_that_is_deaf_is_killed(
+def test_a_process_that_ignores_the_signal_is_killed(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_module, "_TERM_S", 0.2)
-    put(beside, "actor", _DEAF)
+    put(beside, "actor", _IGNORES)
     fleet.start("actor", "actor-0", [])
     pid = ready(beside)
     fleet.stop()
     assert ended(pid)
 
 
-def test_a_service_that_fails_at_once_ends_the_run_with_its_reason(
+def test_a_process_that_fails_at_once_ends_the_run_with_its_reason(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", _DEADLINE_S)
@@ -131,7 +131,7 @@ def test_a_service_that_fails_at_once_ends_the_run_with_its_reason(
         watch_until_ended(fleet)
 
 
-def test_a_service_that_was_killed_is_started_again(
+def test_a_process_that_was_killed_is_restarted(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
@@ -146,7 +146,7 @@ def test_a_service_that_was_killed_is_started_again(
     assert (beside / "actor-0.log").read_text().count("up as --id actor-0") == 2
 
 
-def test_a_service_that_ends_again_and_again_ends_the_run(
+def test_a_process_that_ends_repeatedly_ends_the_run(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
@@ -158,7 +158,7 @@ def test_a_service_that_ends_again_and_again_ends_the_run(
         watch_until_ended(fleet)
 
 
-def test_a_learner_that_diverged_is_not_started_again(
+def test_a_learner_that_diverged_is_not_restarted(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
@@ -170,7 +170,7 @@ def test_a_learner_that_diverged_is_not_started_again(
 
 
 @pytest.mark.parametrize(
-    ("role", "reason"), [("learner", "the learner has done its steps"), ("actor", None)]
+    ("role", "reason"), [("learner", "the learner has finished its steps"), ("actor", None)]
 )
 def test_a_learner_that_ends_well_ends_the_run(
     beside: Path, fleet: Fleet, role: str, reason: str | None
@@ -181,7 +181,7 @@ def test_a_learner_that_ends_well_ends_the_run(
     assert fleet.watch() is None
 
 
-def test_warnings_in_the_logs_are_told_once(beside: Path, fleet: Fleet) -> None:
+def test_warnings_in_the_logs_are_reported_once(beside: Path, fleet: Fleet) -> None:
     (beside / "actor-0.log").write_text("before: 1 WARNING actor: of an earlier start\n")
     put(beside, "actor", _WAITS)
     fleet.start("actor", "actor-0", [])
@@ -196,7 +196,7 @@ def test_warnings_in_the_logs_are_told_once(beside: Path, fleet: Fleet) -> None:
     assert list(fleet.warnings()) == ["actor-0: not whole yet"]
 
 
-def test_settings_in_the_environment_are_not_handed_on(
+def test_settings_in_the_environment_are_not_passed_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MRCDRL_LEARNER__SEED", "1")

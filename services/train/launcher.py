@@ -1,0 +1,189 @@
+"""Launches a run's processes on this machine, follows the run and stops it.
+
+Invariants: what no service could do is refused before anything is written; the run is complete
+without its plots.
+"""
+
+import logging
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from mrcdrl.common.arena import test_starts
+from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_config
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.errors import EndpointError
+from mrcdrl.common.runtime.files import RUN_CONFIG
+from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.runtime.process import COMMAND, StopSignal, available_cores
+from mrcdrl.common.transport import Session
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.monitor.display import display
+from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.recorder import Recorder
+from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.stopping import StoppingRule
+from mrcdrl.services.train.fleet import Fleet
+
+_LOG = logging.getLogger("train")
+_TICK_S = 0.25
+_PLOTS_S = 300.0
+_JOIN_S = 60.0
+_ENOUGH_CORES = 4
+_SHORT = {
+    "arena.num_robots": "--robots",
+    "run.minutes": "--minutes",
+    "run.learner_steps": "--learner-steps",
+    "run.actors": "--actors",
+}
+
+
+def open_run(argv: Sequence[str]) -> RunDirectory:
+    """Create or resume the run that the command line asks for."""
+    parser = Parser(prog="mrcdrl train", description="Train on this machine, with all processes.")
+    parser.add_argument("--config", help=f"a preset or a TOML file; {DEFAULT_PRESET} by default")
+    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
+    parser.add_argument("--name", help="the run's name; made of preset, robots and time by default")
+    parser.add_argument("--resume", metavar="RUN", help="continue this run")
+    add_config_flags(parser, _SHORT)
+    arguments = parser.parse_args(argv)
+    given = overrides(arguments)
+    if arguments.resume:
+        if arguments.name or arguments.config:
+            parser.error("--resume keeps the run's name and configuration: no --name or --config")
+        resumed = Path(arguments.resume)
+        folder = resumed.parent if len(resumed.parts) > 1 else arguments.run_dir
+        return RunDirectory.resume(folder / check_name(resumed.name, "run name"), given)
+    preset = arguments.config or DEFAULT_PRESET
+    config = load_config(preset, given)
+    check_possible(config)
+    name = arguments.name or default_name(preset, config.arena.num_robots)
+    return RunDirectory.create(arguments.run_dir / check_name(name, "run name"), config)
+
+
+def check_possible(config: Config) -> None:
+    """Refuse a run that no service could serve.
+
+    Raises ConfigError if the robots do not fit, EndpointError if a port is in use.
+    """
+    test_starts(config.arena, 1, config.evaluator.seed)
+    if config.transport.listen:
+        Session(config.transport.model_copy(update={"connect": ()})).close()
+
+
+def supervise(
+    run: RunDirectory, fleet: Fleet, recorder: Recorder, endpoint: str, stop: StopSignal
+) -> str:
+    """Run all processes until a signal or the stopping rule ends the run; the reason."""
+    config = run.config
+    state, rule = RunState(config), StoppingRule(config.run)
+    start_replay(run, fleet, endpoint)
+    with join(fleet, transport(config, endpoint)) as session:
+        run.note_endpoint(endpoint)
+        follower = Follower(session, Keys(run.path.name), state, recorder, rule)
+        start_workers(run, fleet, endpoint)
+        with display(state, config, run.path.name, lambda: follower.now) as show:
+            reason = None
+            while reason is None:
+                follower.listen(_TICK_S)
+                for line in fleet.warnings():
+                    state.observe_log(line)
+                show()
+                reason = fleet.watch() or follower.stop_reason()
+                if stop.is_set():
+                    reason = f"stopped ({stop.cause})"
+        if stop.is_set():
+            _LOG.info("stopping (%s) …", stop.cause)
+        else:
+            _LOG.info("%s; stopping …", reason)
+        fleet.stop()
+        follower.listen(_TICK_S)
+    recorder.write_summary(state, follower.now, reason)
+    return reason
+
+
+def transport(config: Config, endpoint: str) -> TransportConfig:
+    """The configured transport, connected to the replay service of this machine."""
+    return config.transport.model_copy(update={"listen": (), "connect": (endpoint,)})
+
+
+def join(fleet: Fleet, transport: TransportConfig) -> Session:
+    """A session with the replay service; raises the reason if that fails to start."""
+    deadline = time.monotonic() + _JOIN_S
+    while True:
+        try:
+            return Session(transport, open_timeout_s=0.0)
+        except EndpointError:
+            fleet.watch()
+            if time.monotonic() > deadline:
+                raise
+
+
+def start_replay(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
+    """Start one replay process that listens itself, or several shards behind a router."""
+    num_shards = run.config.replay.shards
+    if num_shards > 1:
+        fleet.start("router", "router-0", ["--listen", endpoint])
+    for shard in range(num_shards):
+        fleet.start("replay", f"replay-{shard}", replay_arguments(run, endpoint, shard))
+
+
+def start_workers(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
+    """Start the learner, the actors and the evaluators."""
+    evaluators = run.config.run.evaluators
+    for role, count in (
+        ("learner", 1),
+        ("actor", num_actors(run.config)),
+        ("evaluator", evaluators),
+    ):
+        for index in range(count):
+            worker = f"{role}-{index}"
+            fleet.start(role, worker, join_arguments(run, endpoint, worker))
+
+
+def replay_arguments(run: RunDirectory, endpoint: str, shard: int) -> list[str]:
+    """Flags for a replay process."""
+    end = "--listen" if run.config.replay.shards == 1 else "--connect"
+    return [
+        *("--run", run.path.name, "--run-dir", str(run.path.parent)),
+        *("--config", str(run.path / RUN_CONFIG), "--shard", str(shard), end, endpoint),
+    ]
+
+
+def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
+    """Flags for a process that joins the run."""
+    run_dir = str(run.path.parent)
+    name = run.path.name
+    arguments = ["--run", name, "--connect", endpoint, "--run-dir", run_dir, "--id", worker]
+    for field, value in run.config.transport.model_dump(exclude={"listen", "connect"}).items():
+        arguments += [f"--transport.{field}", str(value).lower()]
+    return arguments
+
+
+def expectation(config: Config) -> str:
+    """The cores and actors of this machine, and the pace to expect."""
+    cores, actors = available_cores(), num_actors(config)
+    pace = "" if cores >= _ENOUGH_CORES else f", slower than on the {_ENOUGH_CORES} of the docs"
+    return f"{cores} cores, {actors} actor{'s' if actors > 1 else ''}{pace}"
+
+
+def num_actors(config: Config) -> int:
+    """The configured number, else 1 in lockstep, else half the cores; the rest is the learner's."""
+    return config.run.actors or (1 if config.run.turn_size else max(1, available_cores() // 2))
+
+
+def write_plots(run_dir: Path) -> None:
+    """Write the plots and the video of a run, in a separate process; log it if that fails."""
+    command = [*COMMAND, "report", str(run_dir)]
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=_PLOTS_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        _LOG.warning("plots and video took over %g s and were given up", _PLOTS_S)
+        return
+    if result.returncode:
+        last_line = (result.stderr.splitlines() or ["no reason given"])[-1]
+        _LOG.warning("plots or video are missing: %s", last_line)
