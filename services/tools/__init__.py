@@ -1,1 +1,1 @@
-"""Commands that a person runs beside a run: evaluate, render, figure, report, simulate, doctor …"""
+"""Commands that are not part of a run: evaluate, render, figure, report, simulate, doctor …"""

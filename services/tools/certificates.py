@@ -1,13 +1,13 @@
-"""An authority and a certificate for each role of a run, for trials.
+"""Makes an authority and a certificate for each role of a run, for trials.
 
 DIR/ROLE holds what a process of that role needs, and no more:
 
-    ca.pem           the authority's certificate, by which it knows the others
-    certificate.pem  its own; the common name is the role
+    ca.pem           the authority's certificate, which verifies the others
+    certificate.pem  its own certificate; the common name is the role
     key.pem          its private key
 
-Invariants: what is there and valid is left as it is; keys can be read by their owner only; only a
-router's certificate is accepted from one who listens.
+Invariants: valid files are left as they are; only their owner can read keys; only a router's
+certificate is valid for a listener.
 """
 
 import datetime
@@ -36,7 +36,7 @@ from mrcdrl.common.runtime.names import check_name
 _LISTENING = ("router",)
 _AUTHORITY = "ca"
 _CERTIFICATE, _KEY = "certificate.pem", "key.pem"
-_EARLIER = datetime.timedelta(hours=1)  # for clocks that go slow
+_EARLIER = datetime.timedelta(hours=1)  # for peers whose clocks are slow
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,21 +48,21 @@ class Credentials:
 
     @classmethod
     def read(cls, folder: Path) -> Self | None:
-        """What `write` wrote; None where it is not there or no longer valid."""
+        """Read what `write` wrote; None if it is missing or has expired."""
         try:
             certificate = x509.load_pem_x509_certificate((folder / _CERTIFICATE).read_bytes())
             key = load_pem_private_key((folder / _KEY).read_bytes(), None)
         except FileNotFoundError:
             return None
         except ValueError as error:
-            raise ConfigError(f"{folder}: {error}; remove it to have it made anew") from error
+            raise ConfigError(f"{folder}: {error}; remove it to have it made again") from error
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise ConfigError(f"{folder}: not made by mrcdrl certs")
         expired = certificate.not_valid_after_utc <= datetime.datetime.now(datetime.UTC)
         return None if expired else cls(certificate, key)
 
     def issued(self, certificate: x509.Certificate) -> bool:
-        """Whether the certificate is one of this authority."""
+        """Whether this authority issued the certificate."""
         try:
             certificate.verify_directly_issued_by(self.certificate)
         except (ValueError, TypeError, InvalidSignature):
@@ -70,7 +70,7 @@ class Credentials:
         return True
 
     def write(self, folder: Path) -> None:
-        """Both files, the key first: who has a certificate has its key."""
+        """Write both files, the key first: a certificate always has its key."""
         folder.mkdir(parents=True, exist_ok=True)
         pem = self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         atomic_write(folder / _KEY, pem, 0o600)
@@ -80,9 +80,9 @@ class Credentials:
 def make(
     folder: Path, roles: Iterable[str], hosts: Iterable[str], valid: datetime.timedelta
 ) -> list[str]:
-    """The authority and the roles' certificates that are missing; the names of those made.
+    """Make the missing authority and certificates; return the names of those made.
 
-    hosts: names and addresses under which a router is reached.
+    hosts: names and addresses that reach the router.
     """
     wanted = [check_name(role, "role") for role in roles]
     made = []
@@ -92,8 +92,8 @@ def make(
         authority.write(folder / _AUTHORITY)
         made.append(_AUTHORITY)
     for role in wanted:
-        there = Credentials.read(folder / role)
-        if there is None or not authority.issued(there.certificate):
+        existing = Credentials.read(folder / role)
+        if existing is None or not authority.issued(existing.certificate):
             (folder / role).mkdir(parents=True, exist_ok=True)
             atomic_write(folder / role / "ca.pem", _pem(authority.certificate), 0o644)
             _of_role(role, authority, hosts, valid).write(folder / role)

@@ -1,4 +1,4 @@
-"""`mrcdrl certs`: an authority and a certificate for each role of a run, for trials."""
+"""`mrcdrl certs`: make an authority and a certificate for each role of a run, for trials."""
 
 import datetime
 import importlib.util
@@ -13,25 +13,25 @@ HOSTS = ("localhost", "127.0.0.1", "::1", "router")
 
 
 def main(argv: Sequence[str]) -> int:
-    """Make what is missing in a folder; the exit code."""
+    """Make the certificates that are missing in a directory; return the exit code."""
     parser = Parser(
         prog="mrcdrl certs",
-        description="An authority and a certificate for each role, for trials.",
+        description="Make an authority and a certificate for each role, for trials.",
     )
-    parser.add_argument("folder", metavar="DIR", type=Path, help="where they are kept")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="directory to keep them in")
     parser.add_argument(
         "--host",
         action="append",
         default=[],
-        help=f"a router's name or address besides {', '.join(HOSTS)}",
+        help=f"a name or address of the router besides {', '.join(HOSTS)}",
     )
-    parser.add_argument("--role", action="append", help=f"by default {', '.join(ROLES)}")
-    parser.add_argument("--days", type=int, default=365, help="that they are valid; default: 365")
+    parser.add_argument("--role", action="append", help=f"default: {', '.join(ROLES)}")
+    parser.add_argument("--days", type=int, default=365, help="days of validity; default: 365")
     arguments = parser.parse_args(argv)
     if arguments.days < 1:
         parser.error("--days: at least 1")
     if importlib.util.find_spec("cryptography") is None:
-        raise ConfigError("needs cryptography, not installed here: pip install 'mrcdrl[certs]'")
+        raise ConfigError("needs cryptography, which is not installed: pip install 'mrcdrl[certs]'")
     from mrcdrl.services.tools.certificates import make
 
     valid = datetime.timedelta(days=arguments.days)
@@ -39,5 +39,5 @@ def main(argv: Sequence[str]) -> int:
         made = make(arguments.folder, arguments.role or ROLES, (*HOSTS, *arguments.host), valid)
     except OSError as error:
         raise ConfigError(f"cannot write certificates: {error}") from error
-    print(f"{arguments.folder}: made {', '.join(made) or 'nothing, all is there'}")
+    print(f"{arguments.folder}: made {', '.join(made) or 'nothing, all exist'}")
     return 0

@@ -1,6 +1,6 @@
-"""Evaluation episodes as images: the arena beside what its robots see.
+"""Renders evaluation episodes: the arena beside the images that its robots see.
 
-Invariants: drawn from poses, so that noise is like the noise they saw, and no frame is dropped.
+Invariants: rendered from poses, with the same kind of noise as the robots saw; no frame is dropped.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.film import compose_frame
 
 _ARENA_PX = 600
-_HOLD_FRAMES = 20  # the last image of an episode stays a moment
+_ENDING_FRAMES = 20  # repeats of an episode's last frame
 
 
 class Moment(NamedTuple):
@@ -24,12 +24,12 @@ class Moment(NamedTuple):
     episode: int  # from 1
     frame: int  # from 0
     scene: Scene
-    views: UInt8Array  # [K, V, V], what the robots see
-    ending: str  # the outcome in the last frame, else empty
+    views: UInt8Array  # [K, V, V], the robots' images
+    ending: str  # the outcome, in the last frame; else empty
 
 
 def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[Moment]:
-    """All frames of these episodes, one after the other."""
+    """Yield all frames of these episodes in order."""
     codec = make_codec(config)
     for number, episode in enumerate(episodes, 1):
         last = len(episode.robots) - 1
@@ -42,11 +42,11 @@ def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[
 
 
 def film_frames(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[UInt8Array]:
-    """Images uint8 BGR [H, W, 3] of these episodes, one after the other."""
+    """Yield images uint8 BGR [H, W, 3] of all frames of these episodes, for a film."""
     for number, frame, scene, views, ending in moments(config, episodes):
         caption = f"episode {number} of {len(episodes)}   frame {frame}"
         if ending:
             caption += f"   {ending}"
         image = compose_frame(render_arena(scene, config, _ARENA_PX), views, caption)
-        for _ in range(_HOLD_FRAMES if ending else 1):
+        for _ in range(_ENDING_FRAMES if ending else 1):
             yield image

@@ -1,7 +1,7 @@
-"""`mrcdrl export`: weights as a file that other programs run: ONNX, torch.export or TorchScript.
+"""`mrcdrl export`: write weights for other programs, as ONNX, torch.export or TorchScript.
 
-Invariants: a file is written only when it, read back, gave the values of the network itself for
-states of real episodes, alone and many at once; it computes in float32.
+Invariants: a file is written only if, read back, it gave the network's own values for states of
+real episodes, singly and in batches; it computes in float32.
 """
 
 import importlib.util
@@ -28,18 +28,19 @@ NAMES = ("observation", "q_values")  # uint8 [B, S, V, V], float32 [B, A]
 METADATA = "mrcdrl.json"
 _ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 _STATES = 64
-_TOLERANCE = 1e-4  # of the largest value
+_TOLERANCE = 1e-4  # relative to the largest value
 Run = Callable[[Tensor], Tensor]
 
 
 def main(argv: Sequence[str]) -> int:
-    """Export and say how exactly; the exit code."""
-    parser = subject_parser("export", "Weights for other programs, checked on real images.")
+    """Export, print the largest difference; return the exit code."""
+    parser = subject_parser("export", "Write weights for other programs, checked on real images.")
     suffixes = ", ".join(FORMATS)
     parser.add_argument("--out", type=Path, required=True, help=f"file to write: {suffixes}")
     arguments = parser.parse_args(argv)
     if arguments.out.suffix not in FORMATS:
-        raise ConfigError(f"--out {arguments.out}: the suffix is none of {suffixes}")
+        extension = arguments.out.suffix
+        raise ConfigError(f"--out: unsupported extension {extension!r}; use {suffixes}")
     given = subject(arguments)
     difference = export(given, arguments.out)
     print(f"{arguments.out}: {_STATES} states, largest difference from torch {difference:.2g}")
@@ -47,10 +48,10 @@ def main(argv: Sequence[str]) -> int:
 
 
 def export(given: Subject, out: Path) -> float:
-    """Write the weights as the suffix says; the largest difference from the network's values.
+    """Write the weights in the suffix's format; return the largest difference in values.
 
     Raises ConfigError for a controller, missing packages or a file that cannot be written, and
-    CheckpointError where the file would give other values than the network.
+    CheckpointError if the file's values would differ from the network's.
     """
     if given.policy is None:
         raise ConfigError("a controller cannot be exported: give weights")
@@ -65,7 +66,7 @@ def export(given: Subject, out: Path) -> float:
     }
     states = torch.from_numpy(real_states(given.config, given.policy, _STATES))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch, about its own insides
+        warnings.simplefilter("ignore")  # torch warns about its own internals
         content = pack(network, states[:2], json.dumps(metadata))
         difference = _difference(network, unpack(content), states)
     try:
@@ -76,7 +77,7 @@ def export(given: Subject, out: Path) -> float:
 
 
 def real_states(config: Config, policy: Policy, count: int) -> np.ndarray:
-    """States uint8 [count, S, V, V] of episodes that the policy plays, a third of it by chance."""
+    """States uint8 [count, S, V, V] of episodes played by the policy with epsilon 0.3."""
     arena, codec, rng = config.arena, make_codec(config.arena), np.random.default_rng(0)
     arenas = ArenaBatch(arena, [rng])
     frames = FrameStack(arena.num_robots, arena.stack, arena.view_px)
@@ -112,7 +113,7 @@ def _dynamic() -> dict[int, torch.export.Dim]:
 def _pack_onnx(network: QNetwork, example: Tensor, metadata: str) -> bytes:
     if missing := [name for name in _ONNX_PACKAGES if importlib.util.find_spec(name) is None]:
         raise ConfigError(
-            f".onnx needs {', '.join(missing)}, not installed here: pip install 'mrcdrl[export]'"
+            f".onnx needs {', '.join(missing)}: not installed, use pip install 'mrcdrl[export]'"
         )
     program = torch.onnx.export(
         network,

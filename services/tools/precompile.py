@@ -1,8 +1,8 @@
-"""Compiles what runs compiled, so that no first start has to.
+"""Compiles the numba functions of a run ahead of its first start.
 
-That is what moves and draws robots, and the network's first layer, as actors (states without gaps)
-and the learner (views of longer windows) call it. The machine code goes where numba keeps it
-(NUMBA_CACHE_DIR); another processor compiles anew.
+These move and render robots, and compute the network's first layer as actors (contiguous states)
+and the learner (views of longer windows) call it. numba caches the machine code (NUMBA_CACHE_DIR);
+another processor compiles again.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from mrcdrl.common.model.q_network import QNetwork
 
 
 def main() -> None:
-    """One step of a new episode, drawn as actors do; values of states, and their gradient."""
+    """Step and render a new episode as actors do; compute values of states and their gradient."""
     config = Config()
     arena = config.arena
     arenas = make_arenas(arena, [np.random.default_rng(0)], [0])

@@ -1,4 +1,4 @@
-"""`mrcdrl report RUN`: training.png, trajectories.png and evaluation.mp4 of a run."""
+"""`mrcdrl report RUN`: write training.png, trajectories.png and evaluation.mp4 of a run."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,19 +19,19 @@ _SEED = 0
 
 
 def main(argv: Sequence[str]) -> int:
-    """Draw; the exit code."""
-    parser = Parser(prog="mrcdrl report", description="The images and the film of a run.")
-    parser.add_argument("run", type=Path, help="the run's folder")
+    """Write the plots and the film; return the exit code."""
+    parser = Parser(prog="mrcdrl report", description="Write the plots and the film of a run.")
+    parser.add_argument("run", type=Path, help="the run directory")
     run_dir: Path = parser.parse_args(argv).run
     if not run_dir.is_dir():
-        raise RunDirectoryError(f"{run_dir} is no folder")
+        raise RunDirectoryError(f"{run_dir} is not a directory")
     training_curve(run_dir, run_dir / "training.png")
     draw_episodes(run_dir)
     return 0
 
 
 def draw_episodes(run_dir: Path) -> None:
-    """Trajectories and film of the run's best weights; CheckpointError where it has none."""
+    """Plot and film episodes of the best weights; CheckpointError if the run has no weights."""
     shown = subject(subject_parser("report", "").parse_args([str(run_dir)]))
     arena = shown.config.arena
     starts = test_starts(arena, _EPISODES, _SEED)
@@ -44,5 +44,5 @@ def draw_episodes(run_dir: Path) -> None:
 
 
 def shortest(results: Sequence[EpisodeResult]) -> list[EpisodeResult]:
-    """A few episodes worth watching: the shortest."""
+    """The few shortest episodes, which are the ones to film."""
     return sorted(results, key=lambda r: r.frames)[:_FILMED]

@@ -1,7 +1,7 @@
-"""Evaluation episodes as a recording for rerun's viewer: shapes and images, frame by frame.
+"""Records evaluation episodes for rerun's viewer: shapes and images, frame by frame.
 
-Invariants: the timelines are `frame`, counted over all episodes, and `episode`; places are px of
-the arena, as in common.arena.scene.
+Invariants: the timelines are `frame`, counted over all episodes, and `episode`; positions are px of
+the arena, as in mrcdrl.common.arena.world.scene.
 """
 
 import importlib.util
@@ -25,17 +25,17 @@ _RED, _GREEN, _BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 
 
 def check_rerun() -> None:
-    """Raises ConfigError where rerun is not installed."""
+    """Raise ConfigError if rerun is not installed."""
     if importlib.util.find_spec("rerun") is None:
         raise ConfigError(
-            f"{SUFFIX} needs rerun-sdk, not installed here: pip install 'mrcdrl[rerun]'"
+            f"{SUFFIX} needs rerun-sdk, which is not installed: pip install 'mrcdrl[rerun]'"
         )
 
 
 def write_recording(path: Path, config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> None:
-    """Writes these episodes, which kept their paths, to an .rrd file.
+    """Write these episodes, whose paths were kept, to an .rrd file.
 
-    Raises MrcdrlError when it cannot be written; needs rerun.
+    Raises MrcdrlError if it cannot be written; needs rerun.
     """
     import rerun
 
@@ -62,7 +62,7 @@ def write_recording(path: Path, config: ArenaConfig, episodes: Sequence[EpisodeR
 
 
 def _walls(config: ArenaConfig) -> list[Float64Array]:
-    """The middle lines of the walls: round the arena, and within it."""
+    """Centre lines of the walls, around the arena and within it."""
     near = config.wall_offset_px + config.wall_thickness_px / 2
     far = config.size_px - near
     around = [(near, near), (far, near), (far, far), (near, far), (near, near)]
@@ -70,21 +70,21 @@ def _walls(config: ArenaConfig) -> list[Float64Array]:
 
 
 def _shapes(scene: Scene, config: ArenaConfig) -> dict[str, Any]:
-    """What is drawn of a scene, in rerun's archetypes, by its name."""
+    """The shapes of a scene as rerun archetypes, by name."""
     import rerun
 
-    places, headings = scene.robots[:, :2], scene.robots[:, 2]
+    positions, headings = scene.robots[:, :2], scene.robots[:, 2]
     radius = config.robot_radius_px
     sizes = np.full_like(scene.targets, config.target_size_px)
     ahead = radius * np.stack([np.cos(headings), np.sin(headings)], axis=1)
-    names = [f"robot {robot}" for robot in range(1, len(places) + 1)]
+    names = [f"robot {robot}" for robot in range(1, len(positions) + 1)]
     return {
         "obstacles": rerun.Points2D(
             scene.obstacles[:, :2], radii=scene.obstacles[:, 2], colors=_GREEN
         ),
         "targets": rerun.Boxes2D(centers=scene.targets, sizes=sizes, colors=_BLUE),
         "robots": rerun.Points2D(
-            places, radii=radius, colors=_WHITE, labels=names, show_labels=False
+            positions, radii=radius, colors=_WHITE, labels=names, show_labels=False
         ),
-        "headings": rerun.Arrows2D(origins=places, vectors=ahead, colors=_BLACK),
+        "headings": rerun.Arrows2D(origins=positions, vectors=ahead, colors=_BLACK),
     }

@@ -1,1 +1,1 @@
-"""Looks whether this machine, and a run, have what a run needs."""
+"""Checks that this machine, and a run, have what a run needs."""

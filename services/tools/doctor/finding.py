@@ -1,4 +1,4 @@
-"""What a check found: fine, to be looked at, or failed, and how to mend it."""
+"""The result of a check: ok, a warning or failed, and how to fix it."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,21 +8,21 @@ Verdict = Literal["ok", "warning", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the doctor's."""
+    """One line of the report."""
 
     check: str
     verdict: Verdict
     said: str
-    mend: str = ""  # what to do; empty where nothing is to be done
+    fix: str = ""  # what to do; empty if there is nothing to do
 
 
 def ok(check: str, said: str) -> Finding:
     return Finding(check, "ok", said)
 
 
-def warning(check: str, said: str, mend: str) -> Finding:
-    return Finding(check, "warning", said, mend)
+def warning(check: str, said: str, fix: str) -> Finding:
+    return Finding(check, "warning", said, fix)
 
 
-def failed(check: str, said: str, mend: str) -> Finding:
-    return Finding(check, "failed", said, mend)
+def failed(check: str, said: str, fix: str) -> Finding:
+    return Finding(check, "failed", said, fix)

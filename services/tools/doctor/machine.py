@@ -1,7 +1,7 @@
 """Checks of this machine, none of which needs a run.
 
-Invariants: what a check judges by is given to it where it can be, and read by `of_this_machine`
-otherwise; a check that cannot tell says so, and is no failure.
+Invariants: `of_this_machine` reads the inputs of the checks where possible, so that checks can be
+tested; a check that cannot tell says so and does not fail.
 """
 
 import os
@@ -24,7 +24,7 @@ from mrcdrl.common.transport.shared_memory import SharedBuffer
 from mrcdrl.services.replay.client import table_bytes
 from mrcdrl.services.tools.doctor.finding import Finding, failed, ok, warning
 
-CONSTRAINTS = Path(__file__).parents[2] / "constraints.txt"  # of a checkout
+CONSTRAINTS = Path(__file__).resolve().parents[3] / "constraints.txt"  # in a checkout
 _REQUIREMENT = re.compile(r"([\w.-]+)>=([\d.]+)")
 _CGROUP = Path("/sys/fs/cgroup")
 _INITIAL_PROCESSES = "pid:[4026531836]"  # the kernel's number of the first process namespace
@@ -32,9 +32,9 @@ _OPENER = "import os, sys; os.open(sys.argv[1], os.O_RDWR)"
 
 
 def of_this_machine(config: Config, run_dir: Path, *, running: bool) -> Iterator[Finding]:
-    """All checks.
+    """Run all checks.
 
-    running: the run is up, its table taken already.
+    running: the run is up, so that its table is already allocated.
     """
     yield python_and_packages(requirements(), pins(CONSTRAINTS))
     yield clock()
@@ -46,13 +46,13 @@ def of_this_machine(config: Config, run_dir: Path, *, running: bool) -> Iterator
 
 
 def requirements() -> dict[str, str]:
-    """Least version of each package that mrcdrl needs always."""
+    """Minimum version of each package that mrcdrl always needs."""
     lines = requires("mrcdrl") if installed("mrcdrl") else None
     return {m[1]: m[2] for line in lines or () if (m := _REQUIREMENT.fullmatch(line))}
 
 
 def pins(constraints: Path) -> dict[str, str]:
-    """The versions that mrcdrl is tested with; none outside a checkout."""
+    """Versions that mrcdrl is tested with; empty outside a checkout."""
     if not constraints.is_file():
         return {}
     lines = constraints.read_text("utf-8").splitlines()
@@ -60,47 +60,50 @@ def pins(constraints: Path) -> dict[str, str]:
 
 
 def python_and_packages(least: Mapping[str, str], tested: Mapping[str, str]) -> Finding:
-    """least: version a package must have. tested: version it has in the tests."""
-    check, there = "versions", {name: installed(name) for name in (*least, "torch")}
-    missing = [name for name in least if there[name] is None]
+    """Check the installed versions.
+
+    least: minimum version by package. tested: version used in the tests.
+    """
+    check, have = "versions", {name: installed(name) for name in (*least, "torch")}
+    missing = [name for name in least if have[name] is None]
     if missing:
         return failed(check, f"not installed: {', '.join(missing)}", "pip install --upgrade mrcdrl")
-    old = [f"{n} {there[n]} < {v}" for n, v in least.items() if _numbers(there[n]) < _numbers(v)]
+    old = [f"{n} {have[n]} < {v}" for n, v in least.items() if _numbers(have[n]) < _numbers(v)]
     if old:
         return failed(check, f"too old: {', '.join(old)}", "pip install --upgrade mrcdrl")
     other = [
         f"{name} {version} (tested: {tested[name]})"
-        for name, version in there.items()
+        for name, version in have.items()
         if version is not None and name in tested and _numbers(version) != _numbers(tested[name])
     ]
     if other:
-        mend = "pip install --constraint constraints.txt mrcdrl"
-        return warning(check, f"not as tested: {', '.join(other)}", mend)
-    torch = there["torch"] or "not installed: no actor, learner or evaluator here"
+        fix = "pip install --constraint constraints.txt mrcdrl"
+        return warning(check, f"other versions than tested: {', '.join(other)}", fix)
+    torch = have["torch"] or "not installed: no actor, learner or evaluator can run here"
     python = ".".join(map(str, sys.version_info[:3]))
-    return ok(check, f"Python {python}, zenoh {there.get('eclipse-zenoh')}, torch {torch}")
+    return ok(check, f"Python {python}, zenoh {have.get('eclipse-zenoh')}, torch {torch}")
 
 
 def _numbers(text: str | None) -> tuple[int, ...]:
-    """By which versions are compared; a local part, such as +cpu, does not count."""
+    """The numbers that order versions; a local part, such as +cpu, does not count."""
     return tuple(int(n) for n in re.findall(r"\d+", (text or "").split("+")[0]))
 
 
 def clock(now_s: float | None = None) -> Finding:
-    """Of the wall and monotonic. now_s: since 1970; by default now."""
+    """Check the monotonic clock and the wall clock. now_s: since 1970; default: now."""
     info = time.get_clock_info("monotonic")
     if not info.monotonic or info.resolution > 1e-3:
         said = f"the monotonic clock has steps of {info.resolution:g} s"
-        return warning("clock", said, "choose another clock source of the kernel")
+        return warning("clock", said, "choose another kernel clock source")
     year = time.gmtime(time.time() if now_s is None else now_s).tm_year
     if year < 2024:
-        mend = "set the clock (NTP): starts of learners and actors are ordered by it"
-        return failed("clock", f"it says that the year is {year}", mend)
+        fix = "set the clock (NTP): it orders the starts of learners and actors"
+        return failed("clock", f"it shows the year {year}", fix)
     return ok("clock", f"the year is {year}; monotonic to {info.resolution:g} s")
 
 
 def cpu_quota(cgroup: Path) -> float | None:
-    """Cores' worth of time that this container may use; None for no limit."""
+    """CPU quota of this container, in cores; None if unlimited."""
     try:
         quota, period = (cgroup / "cpu.max").read_text("ascii").split()
     except (OSError, ValueError):
@@ -108,10 +111,10 @@ def cpu_quota(cgroup: Path) -> float | None:
     return None if quota == "max" else int(quota) / int(period)
 
 
-def cores(config: Config, there: int, quota: float | None, environ: Mapping[str, str]) -> Finding:
-    """Threads of one process against the cores it may use, and the share of their time."""
-    may_use = there if quota is None else min(there, quota)
-    said = f"{there}" if quota is None else f"{there}, of whose time {quota:g} may be used"
+def cores(config: Config, num: int, quota: float | None, environ: Mapping[str, str]) -> Finding:
+    """Compare the threads of each process with the cores and the CPU quota."""
+    may_use = num if quota is None else min(num, quota)
+    said = f"{num}" if quota is None else f"{num}, with a CPU quota of {quota:g}"
     asked = {
         "learner.threads": config.learner.threads,
         "actor.threads": config.actor.threads,
@@ -120,18 +123,18 @@ def cores(config: Config, there: int, quota: float | None, environ: Mapping[str,
     }
     many = [f"{name} is {count}" for name, count in asked.items() if count > may_use]
     if many:
-        mend = "set it to what is there: threads wait for one another"
-        return warning("cores", f"{said}; {', '.join(many)}", mend)
-    if quota is not None and quota <= there / 2 and not config.learner.threads:
-        mend = f"set learner.threads to {max(1, int(quota // 2))}: else half the cores are counted"
-        return warning("cores", said, mend)
-    if there < 2:
-        return warning("cores", said, "actors and learner take turns; more cores are faster")
+        fix = "lower it to the number of cores: threads wait for one another"
+        return warning("cores", f"{said}; {', '.join(many)}", fix)
+    if quota is not None and quota <= num / 2 and not config.learner.threads:
+        fix = f"set learner.threads to {max(1, int(quota // 2))}: the default is half the cores"
+        return warning("cores", said, fix)
+    if num < 2:
+        return warning("cores", said, "actors and learner share one core; more cores are faster")
     return ok("cores", said)
 
 
 def free_memory(cgroup: Path) -> int:
-    """Bytes that this machine, and its container, have free."""
+    """Free memory of this machine and its container, in bytes."""
     meminfo = Path("/proc/meminfo").read_text("ascii")
     match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo)
     free = int(match[1]) * 1024 if match else 0
@@ -144,22 +147,22 @@ def free_memory(cgroup: Path) -> int:
 
 
 def memory(needed: int, free: int) -> Finding:
-    """needed: bytes of the table of one shard; 0 where it is there already."""
+    """Check the free memory. needed: bytes of one shard's table; 0 if it is allocated already."""
     said = f"{mib(free)} free"
     if needed:
         said += f", the table takes {mib(needed)}"
     if needed > free:
-        mend = "lower replay.capacity or replay.capacity_bytes, or raise the memory limit"
-        return failed("memory", said, mend)
+        fix = "lower replay.capacity or replay.capacity_bytes, or raise the memory limit"
+        return failed("memory", said, fix)
     if needed > 0.8 * free or free < 512 << 20:
-        return warning("memory", said, "the other processes take some 500 MiB each: leave room")
+        return warning("memory", said, "leave room: every other process takes some 500 MiB")
     return ok("memory", said)
 
 
 def shared_memory() -> Finding:
-    """Whether another process can open memory that this one lends."""
+    """Check that another process can open memory that this one shares."""
     check = "shared memory"
-    mend = "large messages go over the network meanwhile; allow memfds of one user in /proc"
+    fix = "allow a user's memfds in /proc; until then large messages go over the network"
     try:
         buffer = SharedBuffer(1 << 20)
         _, process, descriptor, _ = buffer.address.split()
@@ -170,15 +173,15 @@ def shared_memory() -> Finding:
             lines = opened.stderr.strip().splitlines()
             raise SharedMemoryError(lines[-1] if lines else f"it ended with {opened.returncode}")
     except (OSError, SharedMemoryError, subprocess.TimeoutExpired) as error:
-        return warning(check, f"no process can open what another lends: {error}", mend)
-    said = "a process can open what another lends"
+        return warning(check, f"processes cannot open each other's memory: {error}", fix)
+    said = "processes can open each other's memory"
     if Path("/proc/self/ns/pid").readlink() != Path(_INITIAL_PROCESSES):
-        said += "; in this container only, over the network to others"
+        said += "; within this container, others are reached over the network"
     return ok(check, f"{said}; not needed: {_other_memory()}")
 
 
 def _other_memory() -> str:
-    """What other systems would need, and lent memory does not."""
+    """Limits that other systems depend on, and shared buffers do not."""
     locked, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     memlock = "unlimited" if locked == resource.RLIM_INFINITY else mib(locked)
     shm = mib(shutil.disk_usage("/dev/shm").total) if Path("/dev/shm").is_dir() else "none"
@@ -186,21 +189,21 @@ def _other_memory() -> str:
 
 
 def allocator(environ: Mapping[str, str], *, learns: bool) -> Finding:
-    """learns: this machine has torch."""
+    """Check the allocator's variables. learns: this machine has torch."""
     check, missing = "allocator", [name for name in ALLOCATOR if name not in environ]
     if not learns:
-        return ok(check, "nothing here learns")
+        return ok(check, "not needed without torch")
     if not missing:
         return ok(check, "freed memory stays with the process")
     said = f"{', '.join(missing)} not set; `mrcdrl train` and the images set them"
     if len(missing) == len(ALLOCATOR):
         return ok(check, said)
-    mend = "set all three, as in the Dockerfile: large tensors are mapped afresh at every step"
-    return warning(check, said, mend)
+    fix = "set all three, as in the Dockerfile: else large tensors are mapped again at every step"
+    return warning(check, said, fix)
 
 
 def disk(config: Config, run_dir: Path) -> Finding:
-    """Room for the log of the table and the checkpoints, where runs are kept."""
+    """Check for room for replay's log and the checkpoints in the directory of runs."""
     check, folder = "disk", run_dir.resolve()
     while not folder.exists():
         folder = folder.parent
@@ -208,19 +211,21 @@ def disk(config: Config, run_dir: Path) -> Finding:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        mend = f"give --run-dir another folder, or make {folder} writable"
-        return failed(check, f"{folder} cannot be written: {error.strerror}", mend)
+        fix = f"give --run-dir another directory, or make {folder} writable"
+        return failed(check, f"{folder} cannot be written: {error.strerror}", fix)
     free = shutil.disk_usage(folder).free
     needed = 256 << 20  # checkpoints, records, images
     if config.replay.fsync != "off":
         needed += config.replay.shards * table_bytes(config) + 2 * config.replay.segment_bytes
     said = f"{mib(free)} free in {folder}, a run takes up to {mib(needed)}"
     if free < needed:
-        mend = "free some, give --run-dir another folder, or set replay.fsync to off (no log)"
-        return failed(check, said, mend)
+        fix = (
+            "free some space, give --run-dir another directory, or set replay.fsync to off (no log)"
+        )
+        return failed(check, said, fix)
     return ok(check, said)
 
 
 def mib(size: int) -> str:
-    """Bytes, for a reader."""
+    """Format a number of bytes."""
     return f"{size / 2**30:.1f} GiB" if size >= 1 << 30 else f"{size / 2**20:.0f} MiB"

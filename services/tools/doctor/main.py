@@ -1,4 +1,4 @@
-"""`mrcdrl doctor`: does this machine, and a run, have what is needed; and how to mend it."""
+"""`mrcdrl doctor`: check this machine, and a run, and say how to fix what is wrong."""
 
 import argparse
 import dataclasses
@@ -23,7 +23,7 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red"}
 
 
 def main(argv: Sequence[str]) -> int:
-    """Check and show; 1 where something failed."""
+    """Check and show the findings; return 1 if a check failed."""
     arguments = parser().parse_args(argv)
     config: Config | None = None
     found: list[Finding] = []
@@ -40,20 +40,25 @@ def main(argv: Sequence[str]) -> int:
 
 
 def parser() -> Parser:
-    """The command's flags."""
-    made = Parser(prog="mrcdrl doctor", description="What a run needs, and how to mend it.")
-    made.add_argument("--run", help="the name of a run that is up, to look at it too")
-    made.add_argument("--connect", action="append", help="its endpoint, such as tcp/HOST:7447")
-    made.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
-    made.add_argument("--config", help="a preset or a TOML file; by default the run's")
-    made.add_argument("--json", action="store_true", help="as JSON, a list of what was found")
+    """Make the command's parser."""
+    made = Parser(
+        prog="mrcdrl doctor",
+        description="Check this machine, and a run, and say how to fix what is wrong.",
+    )
+    made.add_argument("--run", help="also check this run, which is up")
+    made.add_argument(
+        "--connect", action="append", help="the run's endpoint, such as tcp/HOST:7447"
+    )
+    made.add_argument("--run-dir", type=Path, default=Path("runs"), help="directory of the runs")
+    made.add_argument("--config", help="a preset or a TOML file; default: the run's")
+    made.add_argument("--json", action="store_true", help="print the findings as JSON")
     made.set_defaults(id="doctor")
     add_config_flags(made)
     return made
 
 
 def look_at_run(arguments: argparse.Namespace) -> tuple[list[Finding], Config | None]:
-    """What was found of the run that the flags name, and its configuration."""
+    """Check the run that the flags name; also return its configuration."""
     try:
         joining = Joining.from_arguments(arguments)
     except EndpointError as error:
@@ -62,14 +67,14 @@ def look_at_run(arguments: argparse.Namespace) -> tuple[list[Finding], Config | 
 
 
 def show(found: Iterable[Finding], console: Console) -> None:
-    """A line each, and below it how to mend it."""
+    """Print a line for each finding, and below it how to fix it."""
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in found:
         text = Text(finding.said)
-        if finding.mend:
-            text.append(f"\n→ {finding.mend}", style="bold")
+        if finding.fix:
+            text.append(f"\n→ {finding.fix}", style="bold")
         table.add_row(Text(finding.verdict, _STYLES[finding.verdict]), finding.check, text)
     console.print(table)

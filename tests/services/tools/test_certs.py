@@ -55,7 +55,7 @@ def test_hosts_are_names_and_addresses(certificates: Path) -> None:
     assert {*dns, *addresses} == set(HOSTS)
 
 
-def test_what_is_there_is_kept_and_what_is_missing_is_made(tmp_path: Path) -> None:
+def test_what_exists_is_kept_and_what_is_missing_is_made(tmp_path: Path) -> None:
     assert make(tmp_path, ["actor"], HOSTS, DAY) == ["ca", "actor"]
     before = certificate(tmp_path, "actor")
     assert make(tmp_path, ["actor", "learner"], HOSTS, DAY) == ["learner"]
@@ -63,13 +63,13 @@ def test_what_is_there_is_kept_and_what_is_missing_is_made(tmp_path: Path) -> No
     assert make(tmp_path, ["actor", "learner"], HOSTS, DAY) == []
 
 
-def test_what_has_expired_is_made_anew(tmp_path: Path) -> None:
+def test_what_has_expired_is_made_again(tmp_path: Path) -> None:
     make(tmp_path, ["actor"], HOSTS, -datetime.timedelta(minutes=30))
     assert make(tmp_path, ["actor"], HOSTS, DAY) == ["ca", "actor"]
     assert make(tmp_path, ["actor"], HOSTS, DAY) == []
 
 
-def test_a_role_of_another_authority_is_made_anew(tmp_path: Path) -> None:
+def test_a_role_of_another_authority_is_made_again(tmp_path: Path) -> None:
     make(tmp_path, ["actor"], HOSTS, DAY)
     for file in (tmp_path / "ca").iterdir():
         file.unlink()
@@ -79,7 +79,7 @@ def test_a_role_of_another_authority_is_made_anew(tmp_path: Path) -> None:
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
     make(tmp_path, ["actor"], HOSTS, DAY)
     (tmp_path / "actor" / "key.pem").write_text("nonsense")
-    with pytest.raises(ConfigError, match="remove it to have it made anew"):
+    with pytest.raises(ConfigError, match="remove it to have it made again"):
         make(tmp_path, ["actor"], HOSTS, DAY)
 
 
@@ -87,7 +87,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main([str(tmp_path), "--role", "actor", "--host", "router.example"]) == 0
     assert "made ca, actor" in capsys.readouterr().out
     assert main([str(tmp_path), "--role", "actor"]) == 0
-    assert "all is there" in capsys.readouterr().out
+    assert "nothing, all exist" in capsys.readouterr().out
 
 
 def test_a_role_that_cannot_be_one_is_refused(tmp_path: Path) -> None:

@@ -31,13 +31,13 @@ SMOKE = load_config("smoke", {}, environ={})
 GIB = 1 << 30
 
 
-def test_this_machine_is_looked_at_whole(tmp_path: Path) -> None:
+def test_this_machine_is_checked_whole(tmp_path: Path) -> None:
     found = list(of_this_machine(SMOKE, tmp_path, running=False))
     checks = ["versions", "clock", "cores", "memory", "shared memory", "allocator", "disk"]
     assert [finding.check for finding in found] == checks
     for finding in found:
         assert finding.said
-        assert bool(finding.mend) == (finding.verdict != "ok"), finding
+        assert bool(finding.fix) == (finding.verdict != "ok"), finding
 
 
 def test_versions_as_required_and_as_tested() -> None:
@@ -53,7 +53,7 @@ def test_versions_as_required_and_as_tested() -> None:
     assert (other.verdict, "tested: 1.0" in other.said) == ("warning", True)
 
 
-def test_versions_are_told_without_torch() -> None:
+def test_versions_are_known_without_torch() -> None:
     with mock.patch(
         "mrcdrl.common.runtime.versions.PACKAGES", {"zenoh": "eclipse-zenoh", "torch": "no-torch"}
     ):
@@ -69,7 +69,7 @@ def test_the_clock() -> None:
 
 
 @pytest.mark.parametrize(
-    ("there", "quota", "threads", "environ", "verdict"),
+    ("num", "quota", "threads", "environ", "verdict"),
     [
         (8, None, 0, {}, "ok"),
         (8, None, 8, {}, "ok"),
@@ -83,10 +83,10 @@ def test_the_clock() -> None:
     ],
 )
 def test_cores(
-    there: int, quota: float | None, threads: int, environ: dict[str, str], verdict: str
+    num: int, quota: float | None, threads: int, environ: dict[str, str], verdict: str
 ) -> None:
     config = load_config("smoke", {"learner.threads": str(threads)}, environ={})
-    assert cores(config, there, quota, environ).verdict == verdict
+    assert cores(config, num, quota, environ).verdict == verdict
 
 
 @pytest.mark.parametrize(
@@ -112,30 +112,30 @@ def test_memory(tmp_path: Path) -> None:
     assert memory(4 * GIB, 3 * GIB).verdict == "failed"
 
 
-def test_the_table_is_as_large_as_is_said() -> None:
+def test_the_table_is_as_large_as_stated() -> None:
     from mrcdrl.services.replay.table import Table
 
     table = Table.from_config(SMOKE)
     assert table_bytes(SMOKE) == pytest.approx(table.nbytes, rel=0.1)
 
 
-def test_memory_can_be_lent() -> None:
+def test_memory_can_be_shared() -> None:
     found = shared_memory()
     assert found.verdict == "ok", found
     assert "memlock" in found.said
 
 
-def test_no_memory_to_lend() -> None:
+def test_no_memory_to_share() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))  # no file more may be opened
     try:
         found = shared_memory()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    assert (found.verdict, bool(found.mend)) == ("warning", True)
+    assert (found.verdict, bool(found.fix)) == ("warning", True)
 
 
-def test_lent_memory_that_nobody_can_open() -> None:
+def test_shared_memory_that_nobody_can_open() -> None:
     refused = subprocess.CompletedProcess(
         [], 1, "", "SharedMemoryError: another container or user\n"
     )

@@ -22,7 +22,7 @@ IDLE = EvaluatorMetrics(evaluations=0, weights_version=0, busy=0)
 
 
 class Run:
-    """What the doctor sees of a run: its configuration, and services that say their figures."""
+    """What the doctor sees of a run: its configuration, and services with statistics."""
 
     def __init__(self) -> None:
         self.endpoint, self.keys = free_endpoint(), Keys(RUN)
@@ -35,7 +35,7 @@ class Run:
         self._thread.start()
 
     def add(self, role: str) -> None:
-        """A service that is there."""
+        """Add a service that is up."""
         self._session.announce(self.keys.live(role, role))
         publisher = self._session.publisher(self.keys.stats(role, role))
         self._reporters.append(StatsReporter(publisher, role, role))
@@ -118,7 +118,7 @@ def test_for_a_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "→ lower replay.capacity" in out
 
 
-def test_an_endpoint_that_is_none_is_left_to_the_session() -> None:
+def test_an_endpoint_that_is_not_tcp_is_left_to_the_session() -> None:
     found = list(endpoints(TransportConfig(connect=("unixsock-stream//tmp/x",))))
     assert [finding.verdict for finding in found] == ["ok"]
     found = list(endpoints(TransportConfig(connect=("tcp/127.0.0.1:99999",))))
@@ -127,7 +127,7 @@ def test_an_endpoint_that_is_none_is_left_to_the_session() -> None:
         Session(TransportConfig(connect=("odd",)), open_timeout_s=0.1)
 
 
-def test_who_is_there() -> None:
+def test_services() -> None:
     assert services(["replay", "actor", "learner"], []).verdict == "ok"
     assert services(["replay", "actor", "learner", "status"], ["status"]).verdict == "ok"
     assert services(["actor", "learner"], []).verdict == "warning"

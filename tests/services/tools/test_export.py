@@ -101,7 +101,10 @@ def test_a_file_of_other_values_is_not_written(
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (("{weights}", "--out", "policy.h5"), "none of .onnx, .pt2, .ts"),
+        (
+            ("{weights}", "--out", "policy.h5"),
+            r"unsupported extension '.h5'; use .onnx, .pt2, .ts",
+        ),
         (("--controller", "greedy", "--out", "policy.ts"), "a controller cannot be exported"),
         (("{weights}", "--out", "{folder}/none/policy.ts"), "cannot be written: No such file"),
     ],
@@ -118,5 +121,7 @@ def test_without_its_packages_onnx_names_the_extra(
     tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
-    with pytest.raises(ConfigError, match=r"needs onnx, onnxscript, onnxruntime.*mrcdrl\[export\]"):
+    with pytest.raises(
+        ConfigError, match=r"needs onnx, onnxscript, onnxruntime: not installed.*mrcdrl\[export\]"
+    ):
         main([str(weights), "--out", str(tmp_path / "policy.onnx"), *FLAGS])

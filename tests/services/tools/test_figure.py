@@ -60,6 +60,23 @@ def test_an_arena_has_as_many_targets_as_robots(tmp_path: Path) -> None:
     assert share(four, blue) / share(one, blue) == pytest.approx(4, rel=0.2)
 
 
+def test_an_arena_has_its_obstacles(tmp_path: Path) -> None:
+    green, out = (0, 255, 0), tmp_path / "arena.png"
+    assert share(drawn(out, "arena"), green) == 0
+    discs = drawn(out, "arena", "--arena.obstacles_px", "[[300, 150, 40], [300, 450, 40]]")
+    random = drawn(out, "arena", "--arena.num_obstacles", 2, "--arena.obstacle_radius_px", 40)
+    assert 0.015 < share(discs, green) < 2 * np.pi * 40**2 / 600**2
+    assert share(random, green) == pytest.approx(share(discs, green), rel=0.05)
+
+
+def test_views_show_obstacles(tmp_path: Path) -> None:
+    argv = ["views", "--controller", "random", *FLAGS, "--frame", 2]
+    plain = drawn(tmp_path / "plain.png", *argv)
+    discs = drawn(tmp_path / "discs.png", *argv, "--arena.obstacles_px", "[[300, 300, 40]]")
+    green_intensity = (150, 150, 150)  # 0.587 of 255
+    assert share(discs, green_intensity) > share(plain, green_intensity) + 0.001
+
+
 def test_arenas_of_runs_and_controllers_stand_side_by_side(tmp_path: Path, run_dir: Path) -> None:
     one = drawn(tmp_path / "one.png", "arena", run_dir)
     two = drawn(tmp_path / "two.png", "arena", run_dir, "--controller", "greedy")
@@ -68,7 +85,7 @@ def test_arenas_of_runs_and_controllers_stand_side_by_side(tmp_path: Path, run_d
 
 
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
-def test_views_are_grey_with_one_rectangle(tmp_path: Path, orientation: str) -> None:
+def test_views_are_intensities_with_one_rectangle(tmp_path: Path, orientation: str) -> None:
     image = drawn(
         tmp_path / "views.png", "views", "--controller", "random", *FLAGS,
         f"--arena.orientation={orientation}", "--frame", 2,
@@ -115,7 +132,7 @@ def test_curves_name_their_runs(tmp_path: Path, run_dir: Path) -> None:
 @pytest.mark.parametrize(
     ("argv", "error", "message"),
     [
-        (["arena", "--out", "a.pdf"], MrcdrlError, "none of .png, .svg"),
+        (["arena", "--out", "a.pdf"], MrcdrlError, "extension '.pdf'; use .png or .svg"),
         (["arena", "--out", "missing/a.png"], MrcdrlError, "No such file"),
         (
             ["trajectories", "--controller", "greedy", "--episodes", "1", "--out", "missing/a.png"],
@@ -127,9 +144,9 @@ def test_curves_name_their_runs(tmp_path: Path, run_dir: Path) -> None:
         (["trajectories", "--controller", "greed"], ConfigError, "did you mean greedy"),
         (["trajectories", "none.safetensors"], CheckpointError, "No such file"),
         (["comparison", "--controller", "greedy"], ConfigError, "at least two"),
-        (["curves"], ConfigError, "give their folders"),
-        (["curves", "a", "--controller", "greedy"], ConfigError, "give their folders"),
-        (["curves", "missing"], RunDirectoryError, "missing is no run's folder"),
+        (["curves"], ConfigError, "takes run directories only"),
+        (["curves", "a", "--controller", "greedy"], ConfigError, "takes run directories only"),
+        (["curves", "missing"], RunDirectoryError, "missing is not a directory"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(
