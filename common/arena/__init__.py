@@ -1,7 +1,7 @@
 """The paper's 2-D arena: physics, rewards, starts and the robots' images.
 
-Invariant: the arena knows neither networks nor services. Import everything else from its
-module.
+Invariant: the arena knows neither networks nor services. Everything else is imported from
+its module.
 """
 
 from mrcdrl.common.arena.arena import Arena

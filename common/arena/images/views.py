@@ -71,7 +71,7 @@ def _render_views(  # type: ignore[no-untyped-def]
     size = out.shape[1]
     lines = np.empty((2, _NUM_LINES * size))
     crop_half_px, target_half_px = halves_px
-    target_half = target_half_px * scale
+    half = target_half_px * scale  # of a target
     line_half, cap = HEADING_HALF_PX * scale, HEADING_CAP_PX * scale
     reach = radius + cap
     for n in range(len(scenes)):
@@ -80,15 +80,12 @@ def _render_views(  # type: ignore[no-untyped-def]
         view[:] = 0
         own_x = np.float64(scene[0])
         own_y = np.float64(scene[1])
-        c, s = 1.0, 0.0
+        c, s = 1.0, 0.0  # positions map to (c x - s y, s x + c y) about the robot
         if heading_up:
             c, s = -math.sin(scene[2]), -math.cos(scene[2])
-        else:
-            own_x, own_y = _on_grid(own_x, crop_half_px), _on_grid(own_y, crop_half_px)
-        # positions map to (c x - s y, s x + c y) about the robot
-        if heading_up:
             _walls_slanted(view, lines, own_x, own_y, c, s, scale, wall)
         else:
+            own_x, own_y = _on_grid(own_x, crop_half_px), _on_grid(own_y, crop_half_px)
             _walls_upright(view, own_x, own_y, scale, wall)
         _inner_walls(view, lines, own_x, own_y, c, s, scale, inner_walls)
         for j in range(obstacles, obstacles + 3 * num_obstacles, 3):
@@ -98,27 +95,9 @@ def _render_views(  # type: ignore[no-untyped-def]
             x, y = _on_grid(scene[j], target_half_px), _on_grid(scene[j + 1], target_half_px)
             x, y = _map(x - own_x, y - own_y, c, s, scale, size)
             if heading_up:
-                _bar(
-                    view,
-                    lines,
-                    x,
-                    y,
-                    c,
-                    s,
-                    -target_half,
-                    target_half,
-                    target_half,
-                    TARGET_INTENSITY,
-                )
+                _bar(view, lines, x, y, c, s, -half, half, half, TARGET_INTENSITY)
             else:
-                _box(
-                    view,
-                    x - target_half,
-                    x + target_half,
-                    y - target_half,
-                    y + target_half,
-                    TARGET_INTENSITY,
-                )
+                _box(view, x - half, x + half, y - half, y + half, TARGET_INTENSITY)
         for j in range(0, 3 * num_robots, 3):
             x, y = _map(scene[j] - own_x, scene[j + 1] - own_y, c, s, scale, size)
             _disc(view, lines, x, y, radius, ROBOT_INTENSITY)
