@@ -7,31 +7,39 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.live import Live
 
-from mrcdrl.common.config import Config
-from mrcdrl.services.monitor.screen import plain_line, screen
+from mrcdrl.services.monitor.screen import Screen, plain_line
 from mrcdrl.services.monitor.state import RunState
 
 _PLAIN_PERIOD_S = 10.0
+Show = Callable[[], None]
 
 
 @contextmanager
-def display(
-    state: RunState, config: Config, name: str, clock: Callable[[], float]
-) -> Iterator[Callable[[], None]]:
+def display(state: RunState, name: str, clock: Callable[[], float]) -> Iterator[Show]:
     """Yield a function that shows the state now: on a live screen, or as a plain line."""
     console = Console()
     if not console.is_terminal:
-        due_s = [0.0]
 
         def print_line() -> None:
-            if clock() >= due_s[0]:
-                due_s[0] = clock() + _PLAIN_PERIOD_S
-                console.print(plain_line(state, clock()), soft_wrap=True, highlight=False)
+            console.print(plain_line(state, clock()), soft_wrap=True, highlight=False)
 
-        yield print_line
+        yield at_most_every(_PLAIN_PERIOD_S, clock, print_line)
         return
     with logging_to(state), Live(console=console, screen=True, auto_refresh=False) as live:
-        yield lambda: live.update(screen(state, config, clock(), name), refresh=True)
+        yield lambda: live.update(Screen(state, clock(), name), refresh=True)
+
+
+def at_most_every(period_s: float, clock: Callable[[], float], show: Show) -> Show:
+    """`show`, skipped until a period has passed since the last time."""
+    due_s = 0.0
+
+    def show_when_due() -> None:
+        nonlocal due_s
+        if clock() >= due_s:
+            due_s = clock() + period_s
+            show()
+
+    return show_when_due
 
 
 @contextmanager

@@ -75,7 +75,7 @@ class Share:
         return sum(value for _, value in self._values) / max(1, len(self._values))
 
 
-class Spreading:
+class SpreadWindow:
     """Spread of the values of the last SPREAD_S seconds."""
 
     def __init__(self) -> None:

@@ -24,11 +24,10 @@ from mrcdrl.services.monitor.records import (
     EpisodeRecord,
     EvaluationRecord,
     cut_torn_line,
-    episode_line,
-    evaluation_line,
     read_episodes,
     read_evaluations,
     read_last_metrics,
+    record_line,
     to_line,
 )
 from mrcdrl.services.monitor.state import COUNTERS, RunState
@@ -96,9 +95,9 @@ class Recorder(Closing):
 
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
         """Write an episode that `state` has observed."""
-        line = episode_line(EpisodeRecord(now, state.learner_steps, episode))
+        record = EpisodeRecord(now, state.learner_steps, episode)
         with self._writing():
-            self._episodes.write(line)
+            self._episodes.write(record_line(record))
         self._event("training/score", episode.score, state.episodes)
         self._event("training/mean_q", episode.mean_q, state.episodes)
         if state.successes_per_100 is not None:
@@ -107,7 +106,7 @@ class Recorder(Closing):
     def record_evaluation(self, record: EvaluationRecord) -> None:
         """Write what `state.observe_evaluation` returned."""
         with self._writing():
-            self._evaluations.write(evaluation_line(record))
+            self._evaluations.write(record_line(record))
             self._evaluations.flush()
         for name in EVALUATION_FIELDS:
             value = getattr(record.evaluation, name)

@@ -58,18 +58,16 @@ def finite(value: Any) -> Any:
     return value
 
 
-def episode_line(record: EpisodeRecord) -> str:
-    head = {"time_s": round(record.time_s, 3), "learner_steps": record.learner_steps}
-    return to_line({**head, **asdict(record.episode)})
+def flat(record: EpisodeRecord | EvaluationRecord) -> dict[str, Any]:
+    """The record and its message as one flat object."""
+    values = asdict(record)
+    values |= values.pop("episode" if isinstance(record, EpisodeRecord) else "evaluation")
+    return values
 
 
-def evaluation_line(record: EvaluationRecord) -> str:
-    head = {
-        "time_s": round(record.time_s, 3),
-        "env_steps": record.env_steps,
-        "robot_steps": record.robot_steps,
-    }
-    return to_line({**head, **asdict(record.evaluation)})
+def record_line(record: EpisodeRecord | EvaluationRecord) -> str:
+    """The record as one line of JSON."""
+    return to_line(flat(record) | {"time_s": round(record.time_s, 3)})
 
 
 def _pick(values: Mapping[str, Any], message: type) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from mrcdrl.common.config import Config
 from mrcdrl.services.monitor.bottleneck import bottleneck, bottleneck_line, thousands, waiting_for
 from mrcdrl.services.monitor.service_table import ROLE_STYLES, services
 from mrcdrl.services.monitor.state import RunState
@@ -25,25 +24,19 @@ _DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
 _BLANK = 0x2800
 
 
-def screen(state: RunState, config: Config, now: float, name: str = "") -> RenderableType:
-    """The whole screen at `now`; name: the run's, for the header."""
-    return Screen(state, config, now, name)
-
-
 @dataclass(frozen=True, slots=True)
 class Screen:
-    """Lays itself out for its console."""
+    """The whole screen at `now`, laid out for its console."""
 
     state: RunState
-    config: Config
     now: float
-    name: str
+    name: str  # of the run
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         rows = Rows.of(options.height or console.size.height, len(self.state.services))
         width = options.max_width
         lines: list[RenderableType] = [
-            header(self.state, self.config, self.now, self.name, width),
+            header(self.state, self.now, self.name, width),
             *ring(self.state, self.now),
             heading("processes"),
             services(self.state, self.now, rows.services),
@@ -91,10 +84,11 @@ def heading(title: str, more: str = "", style: str = "grey62") -> Rule:
     return Rule(text, align="left", style="grey37")
 
 
-def header(state: RunState, config: Config, now: float, name: str, width: int) -> Text:
+def header(state: RunState, now: float, name: str, width: int) -> Text:
     """One bar with the run's name, arena and agent, its time and the time left."""
+    config = state.config
     robots = f"{config.arena.num_robots} robot{'s' * (config.arena.num_robots != 1)}"
-    left = f" mrcdrl  {name + '  ' if name else ''}{robots} · {config.agent.kind}"
+    left = f" mrcdrl  {name}  {robots} · {config.agent.kind}"
     left += f" · {config.arena.target_layout} targets"
     remaining = state.time_left_s(now)
     right = clock(now) + (f"  {clock(remaining)} left " if remaining is not None else " ")

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.metrics import M, of_kind, read
 from mrcdrl.common.messages.trajectory import NO_SLOT, EpisodeSummary, Evaluation, Outcome, Stats
-from mrcdrl.services.monitor.rates import Rate, Share, Spread, Spreading
+from mrcdrl.services.monitor.rates import Rate, Share, Spread, SpreadWindow
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW, EvaluationRecord
 
 ROLES = ("actor", "replay", "learner", "evaluator", "status")
@@ -38,7 +38,7 @@ class Service:
     text: dict[str, str] = field(default_factory=dict)
     rates: dict[str, Rate] = field(default_factory=dict)
     shares: dict[str, Share] = field(default_factory=dict)
-    staleness: dict[str, Spreading] = field(default_factory=dict)  # of an actor's weights, by unit
+    staleness: dict[str, SpreadWindow] = field(default_factory=dict)  # of its weights, by unit
 
     def read(self, schema: type[M]) -> M:
         """Its metrics as last reported, shares averaged over the window."""
@@ -113,7 +113,7 @@ class RunState:
                 service.shares.setdefault(name, Share()).observe(stats.metrics[name], now)
         stale = self.staleness(service) if stats.role == "actor" else None
         for unit, value in zip(STALENESS, stale or (), strict=False):
-            service.staleness.setdefault(unit, Spreading()).observe(value, now)
+            service.staleness.setdefault(unit, SpreadWindow()).observe(value, now)
 
     def observe_episode(self, episode: EpisodeSummary) -> None:
         self.episodes += 1

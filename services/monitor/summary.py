@@ -13,7 +13,7 @@ from typing import Any
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.runtime.versions import all_versions
-from mrcdrl.services.monitor.records import EvaluationRecord, finite
+from mrcdrl.services.monitor.records import EvaluationRecord, finite, flat
 from mrcdrl.services.monitor.state import RunState
 
 REACHED = (0.5, 0.8, 0.9, 0.94)
@@ -68,14 +68,7 @@ def training_table(state: RunState) -> dict[str, float | int | None]:
 
 
 def _evaluation(record: EvaluationRecord | None) -> dict[str, Any] | None:
-    if record is None:
-        return None
-    head = {
-        "time_s": record.time_s,
-        "env_steps": record.env_steps,
-        "robot_steps": record.robot_steps,
-    }
-    return {**head, **asdict(record.evaluation)}
+    return None if record is None else flat(record)
 
 
 def _reached(state: RunState, rate: float) -> dict[str, float | int] | None:

@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from typing import Any
 
 from rich.console import Console
@@ -15,19 +15,18 @@ from mrcdrl.common.runtime.versions import VERSIONED
 from mrcdrl.common.sync.joining import Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
 from mrcdrl.services.monitor.bottleneck import bottleneck
-from mrcdrl.services.monitor.display import display
+from mrcdrl.services.monitor.display import Show, at_most_every, display
 from mrcdrl.services.monitor.follower import Follower
 from mrcdrl.services.monitor.recorder import Recorder, flat_metrics
 from mrcdrl.services.monitor.records import finite
 from mrcdrl.services.monitor.run_directory import RunDirectory
-from mrcdrl.services.monitor.screen import screen
+from mrcdrl.services.monitor.screen import Screen
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
 
 _TICK_S = 0.25
 _LISTEN_S = 3.0  # every service reports once a second, and two reports make a rate
 _JSON_PERIOD_S = 1.0
-Show = Callable[[], None]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -48,10 +47,14 @@ def main(argv: Sequence[str]) -> int:
             listen(follower, Heartbeat(None), stop, lambda: None, until_s=_LISTEN_S)
             print_once(state, follower.now, joining.run, arguments.json)
             return 0
-        showing: AbstractContextManager[Show] = (
-            json_lines(state, lambda: follower.now)
+
+        def print_line() -> None:
+            print_once(state, follower.now, joining.run, as_json=True)
+
+        showing = (
+            nullcontext(at_most_every(_JSON_PERIOD_S, lambda: follower.now, print_line))
             if arguments.json
-            else display(state, config, joining.run, lambda: follower.now)
+            else display(state, joining.run, lambda: follower.now)
         )
         # Only a recorder is a service: status run in its container must not beat for it.
         heartbeat = Heartbeat.from_environment() if arguments.record else Heartbeat(None)
@@ -99,20 +102,7 @@ def print_once(state: RunState, now: float, run: str, as_json: bool) -> None:
     if as_json:
         console.out(json.dumps(status(state, now)), highlight=False)
     else:
-        console.print(screen(state, state.config, now, run), height=console.height - 1)
-
-
-@contextmanager
-def json_lines(state: RunState, clock: Callable[[], float]) -> Iterator[Show]:
-    """Yield a function that prints the status as a line of JSON, at most once a second."""
-    console, due_s = Console(), [0.0]
-
-    def print_line() -> None:
-        if clock() >= due_s[0]:
-            due_s[0] = clock() + _JSON_PERIOD_S
-            console.out(json.dumps(status(state, clock())), highlight=False)
-
-    yield print_line
+        console.print(Screen(state, now, run), height=console.height - 1)
 
 
 def status(state: RunState, now: float) -> dict[str, Any]:

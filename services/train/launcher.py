@@ -80,11 +80,11 @@ def supervise(
     config = run.config
     state, rule = RunState(config), StoppingRule(config.run)
     start_replay(run, fleet, endpoint)
-    with join(fleet, transport(config, endpoint)) as session:
+    with join(fleet, config.transport, endpoint) as session:
         run.note_endpoint(endpoint)
         follower = Follower(session, Keys(run.path.name), state, recorder, rule)
         start_workers(run, fleet, endpoint)
-        with display(state, config, run.path.name, lambda: follower.now) as show:
+        with display(state, run.path.name, lambda: follower.now) as show:
             reason = None
             while reason is None:
                 follower.listen(_TICK_S)
@@ -104,17 +104,13 @@ def supervise(
     return reason
 
 
-def transport(config: Config, endpoint: str) -> TransportConfig:
-    """The configured transport, connected to the replay service of this machine."""
-    return config.transport.model_copy(update={"listen": (), "connect": (endpoint,)})
-
-
-def join(fleet: Fleet, transport: TransportConfig) -> Session:
+def join(fleet: Fleet, transport: TransportConfig, endpoint: str) -> Session:
     """A session with the replay service; raises the reason if that fails to start."""
+    connected = transport.model_copy(update={"listen": (), "connect": (endpoint,)})
     deadline = time.monotonic() + _JOIN_S
     while True:
         try:
-            return Session(transport, open_timeout_s=0.0)
+            return Session(connected, open_timeout_s=0.0)
         except EndpointError:
             fleet.watch()
             if time.monotonic() > deadline:

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from mrcdrl.common.config import load_config
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
-from mrcdrl.services.monitor.screen import braille_curve, plain_line, resample, screen
+from mrcdrl.services.monitor.screen import Screen, braille_curve, plain_line, resample
 from mrcdrl.services.monitor.state import RunState
 
 CONFIG = load_config("quick", {"run.minutes": "20", "arena.num_robots": "4"}, environ={})
@@ -44,7 +44,7 @@ def busy_state(num_actors: int) -> RunState:
 
 def rendered(state: RunState, width: int, height: int, now: float) -> list[str]:
     console = Console(width=width, height=height, record=True, file=io.StringIO())
-    console.print(screen(state, CONFIG, now, "quick-1"))
+    console.print(Screen(state, now, "quick-1"))
     text = console.export_text().replace("\N{NO-BREAK SPACE}", " ")
     return text.removesuffix("\n").split("\n")
 
