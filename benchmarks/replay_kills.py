@@ -79,7 +79,7 @@ def ordeal(folder: Path, kills: int, seed: int, capacity: int, longest_s: float)
     config = load_config("smoke", {**CONFIG, "replay.capacity": str(capacity)}, environ={})
     (folder / "kills.toml").write_text(to_toml(config), "utf-8")
     name, rng = run_name("kills"), random.Random(seed)
-    service = Service(folder, name)
+    service = ReplayProcess(folder, name)
     began_s = time.monotonic()
     try:
         service.begin()
@@ -118,7 +118,7 @@ def ordeal(folder: Path, kills: int, seed: int, capacity: int, longest_s: float)
 
 
 @dataclass
-class Service:
+class ReplayProcess:
     """The replay process and its successors."""
 
     folder: Path

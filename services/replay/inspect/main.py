@@ -110,8 +110,8 @@ def _lines(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "weights", f"versions {weights['oldest']} to {weights['newest']}"
         left, straight, right = found["actions"]
         yield "actions", f"{left} left, {straight} straight, {right} right"
-        share = found["terminations"] / max(found["transitions"], 1)
-        yield "ends", f"{found['terminations']} transitions reach a termination ({share:.2%})"
+        fraction = found["terminations"] / max(found["transitions"], 1)
+        yield "ends", f"{found['terminations']} transitions reach a termination ({fraction:.2%})"
 
 
 def _ago(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Slots of exploration: who gets which, and that two actors never hold one."""
+"""Leases of exploration slots: who gets which, and that two actors never hold the same one."""
 
 from dataclasses import dataclass, field
 
@@ -16,7 +16,7 @@ ANSWER_S = 2.0
 
 
 def opened(num_places: int = 0) -> LeaseTable:
-    """A table whose first leases could all have been claimed again: it is later than 0."""
+    """A table that is past the time when only claimed slots are granted."""
     return LeaseTable(LEASE_S, num_places, -LEASE_S)
 
 
@@ -30,17 +30,17 @@ def ends(actor: str, incarnation: int = 1) -> LeaseRequest:
     return LeaseRequest(actor, incarnation, NO_SLOT, holds=False, ends=True)
 
 
-def test_the_lowest_free_slot_is_given_and_prolonged() -> None:
+def test_the_lowest_free_slot_is_granted_and_renewed() -> None:
     table = opened()
     assert [table.answer(wish(name), 0).slot for name in "abc"] == [0, 1, 2]
     assert table.answer(ends("b"), 1).slot == NO_SLOT
     assert table.answer(wish("d"), 1).slot == 1
     assert table.answer(wish("a"), 9).slot == 0
-    assert table.answer(wish("e"), 10).slot == 2, "c was not heard of for a lease"
+    assert table.answer(wish("e"), 10).slot == 2, "c did not renew its lease"
     assert table.answer(wish("c"), 10).slot == 3
 
 
-def test_the_place_on_the_ladder_is_the_rank_among_those_that_hold_a_slot() -> None:
+def test_the_rank_counts_the_lower_slots_that_are_held() -> None:
     table = opened()
     replies = [table.answer(wish(name), 0) for name in "abc"]
     assert (replies[2].rank, replies[2].num_places) == (2, 3)
@@ -49,22 +49,24 @@ def test_the_place_on_the_ladder_is_the_rank_among_those_that_hold_a_slot() -> N
     assert (c.slot, c.rank, c.num_places) == (2, 1, 2)
 
 
-def test_a_ladder_of_a_set_size_has_its_places_and_no_more() -> None:
+def test_a_schedule_of_a_set_size_grants_no_more_slots() -> None:
     table = opened(num_places=2)
     assert table.answer(wish("a"), 0) == LeaseReply(0, 0, 2, LEASE_S)
     assert table.answer(wish("b"), 0) == LeaseReply(1, 1, 2, LEASE_S)
     assert table.answer(wish("c"), 0).slot == NO_SLOT
     table.answer(ends("a"), 1)
-    assert table.answer(wish("c", slot=7), 1).slot == 0, "7 is no slot of this ladder"
+    assert table.answer(wish("c", slot=7), 1).slot == 0, "7 is not a slot of this schedule"
 
 
-def test_an_actor_started_again_takes_a_free_slot_and_its_own_where_that_is_one() -> None:
+def test_a_restarted_actor_gets_its_own_slot_once_that_is_free() -> None:
     table = opened()
     for name in "abc":
         table.answer(wish(name), 0)
     table.answer(wish("c", slot=2, holds=True), 5)
-    assert table.answer(wish("a", incarnation=2), 6).slot == 3, "its earlier start may live yet"
-    assert table.answer(wish("b", incarnation=2), 11).slot == 1, "not 0, which is free as well"
+    assert table.answer(wish("a", incarnation=2), 6).slot == 3, (
+        "its earlier start may still be alive"
+    )
+    assert table.answer(wish("b", incarnation=2), 11).slot == 1, "not 0, which is also free"
 
 
 def test_a_lost_slot_is_not_taken_back() -> None:
@@ -74,7 +76,7 @@ def test_a_lost_slot_is_not_taken_back() -> None:
     assert table.answer(wish("a", slot=0), 11).slot == 1
 
 
-def test_who_was_stopped_gives_back_nothing_of_another() -> None:
+def test_a_late_end_does_not_free_another_actors_slot() -> None:
     table = opened()
     table.answer(wish("a"), 0)
     table.answer(wish("b"), 10)
@@ -110,7 +112,7 @@ def test_an_answer_that_was_long_under_way_gives_nothing() -> None:
 
 @dataclass
 class Asked:
-    """A request under way, or its answer."""
+    """A request in flight, or its answer."""
 
     request: LeaseRequest
     asked_s: float  # by the actor's clock
@@ -121,7 +123,7 @@ class Asked:
 
 @dataclass
 class Actor:
-    """A process; what it believes is what is judged."""
+    """A process; the test checks what it believes to hold."""
 
     name: str
     rate: float  # of its clock
@@ -130,8 +132,8 @@ class Actor:
 
 
 class LeasesAgainstTime(RuleBasedStateMachine):
-    """Actors ask, are stopped for any time, killed, started again; messages are late or lost,
-    replay starts again, and no two clocks run alike: nowhere two that believe to hold one slot."""
+    """Actors ask, are paused, killed and restarted; messages are late or lost, replay restarts, and
+    all clocks run at different rates: no two actors ever believe to hold the same slot."""
 
     @initialize(num_places=st.sampled_from([0, 0, 2]), rate=st.floats(0.96, 1.04))
     def begin(self, num_places: int, rate: float) -> None:
@@ -193,7 +195,7 @@ class LeasesAgainstTime(RuleBasedStateMachine):
         self.now_s += seconds
 
     def arrive(self, asked: Asked) -> None:
-        """At replay; one that asked an earlier process of it, only while the question stands."""
+        """Reach replay; an earlier replay process's request only until it times out."""
         if asked.table == self.tables or self.now_s - asked.sent_s < 0.9 * ANSWER_S:
             asked.reply = self.table.answer(asked.request, self.rate * self.now_s)
 
@@ -210,7 +212,7 @@ class LeasesAgainstTime(RuleBasedStateMachine):
         assert len(held) == len(set(held)), slots
 
     def teardown(self) -> None:
-        """Whatever was: when all ask again and again, each has a place of its own."""
+        """Whatever happened before: once all keep asking, each has its own rank."""
         for _ in range(8):
             self.now_s += LEASE_S / 3
             for actor in self.actors:
@@ -229,7 +231,7 @@ TestLeasesAgainstTime.settings = settings(max_examples=150, stateful_step_count=
 
 
 @pytest.mark.parametrize("count", [1, 7])
-def test_who_holds_what_is_shown(count: int) -> None:
+def test_the_repr_shows_the_holders(count: int) -> None:
     table = opened()
     for number in range(count):
         table.answer(wish(f"actor-{number}"), 0)

@@ -1,4 +1,4 @@
-"""The service's answers, with requests and servers in memory."""
+"""The service's answers to requests in memory."""
 
 import dataclasses
 import queue
