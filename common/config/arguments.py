@@ -55,8 +55,7 @@ def add_config_flags(
 ) -> None:
     """Add a flag for every field of the configuration.
 
-    short: shorter spellings, such as {"arena.num_robots": "--robots"}. only: sections to add; all
-    if empty.
+    short: shorter spellings, such as {"arena.num_robots": "--robots"}. only: these sections.
     """
     shorter = short or {}
     for section, model in sections().items():

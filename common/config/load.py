@@ -6,6 +6,7 @@ Invariant: an unknown name is refused, and the nearest known one suggested.
 
 import difflib
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 
 from mrcdrl.common.config.schema import Config, TransportConfig, sections
 from mrcdrl.common.errors import ConfigError
@@ -29,6 +29,7 @@ _TYPES = {
     "string": "must be text",
     "tuple": "must be a list",
 }
+_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
 def preset_names() -> list[str]:
@@ -71,9 +72,7 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
     if base not in preset_names():
         base = str(path.parent / str(base))
     if base in (*above, source):
-        raise ConfigError(
-            f"config {source!r} extends itself, through {', '.join((*above, source))}"
-        )
+        raise ConfigError(f"config {source!r} extends itself via {', '.join((*above, source))}")
     below = _read_toml(base, (*above, source))
     return below | {name: {**below.get(name, {}), **values} for name, values in table.items()}
 
@@ -103,11 +102,11 @@ def _parse_value(text: str) -> Any:
 
 def _merge_text(table: dict[str, Any], dotted: str, text: str, where: str) -> None:
     section, _, name = dotted.partition(".")
-    value = {section: {name: _parse_value(text)}} if name else {section: {}}
     if not name:
         raise ConfigError(f"{where}: {dotted!r} is not a setting; write SECTION.FIELD")
-    _check_names(value, where)
-    table[section] = {**table.get(section, {}), **value[section]}
+    value = {name: _parse_value(text)}
+    _check_names({section: value}, where)
+    table[section] = {**table.get(section, {}), **value}
 
 
 def environment_overrides(environ: Mapping[str, str]) -> dict[str, str]:
@@ -193,24 +192,16 @@ def _one_line(*above: str) -> Iterator[None]:
 
 
 def _requirement(path: Sequence[str | int], error: Mapping[str, Any]) -> str:
-    """What the setting must be; pydantic's own words where ours have none."""
+    """Describe the values allowed, in our words for the common kinds of error."""
     kind = error["type"].partition("_")[0]
-    if kind in ("greater", "less"):
-        field = sections()[str(path[0])].model_fields[str(path[1])]
-        return f"must be {_limits(field)}"
-    message: str = error["msg"].removeprefix("Value error, ")
-    return _TYPES.get(kind) or message.replace("Input should be", "must be")
-
-
-def _limits(field: FieldInfo) -> str:
-    """The limits of a number in words, such as "between 1 and 10"."""
-    given = {
-        name: f"{getattr(bound, name):g}"
-        for bound in field.metadata
-        for name in ("ge", "gt", "le", "lt")
+    if kind not in ("greater", "less"):
+        message: str = error["msg"].removeprefix("Value error, ")
+        return _TYPES.get(kind) or message.replace("Input should be", "must be")
+    bounds = sections()[str(path[0])].model_fields[str(path[1])].metadata
+    limits = " and ".join(
+        f"{words} {getattr(bound, name):g}"
+        for bound in bounds
+        for name, words in _LIMITS.items()
         if hasattr(bound, name)
-    }
-    if given.keys() == {"ge", "le"}:
-        return f"between {given['ge']} and {given['le']}"
-    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    return " and ".join(f"{words[name]} {bound}" for name, bound in given.items())
+    )
+    return "must be " + re.sub("at least (.*) and at most", r"between \1 and", limits)

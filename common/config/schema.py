@@ -96,9 +96,8 @@ class ArenaConfig(Section):
     """Consecutive images that make a state. (paper)"""
     renderer: Literal["analytic", "literal"] = "analytic"
     """`literal` draws at 600x600, converts to intensity, crops, pads and area-resizes as the paper
-    does; `analytic` computes the same coverage directly at 60x60, except where an image's pixel is
-    less than 2.5 px of the arena: there single pixels show, and it draws as `literal` does. (ours)
-    """
+    does; `analytic` computes the same coverage directly at 60x60, but draws as `literal` does where
+    an image's pixel is less than 2.5 px of the arena, and single pixels show. (ours)"""
     pixel_noise: Annotated[float, Field(ge=0)] = 0
     """Standard deviation of the noise on every pixel of a robot's image, in intensity levels.
     (ours)"""
@@ -406,9 +405,8 @@ class RunConfig(Section):
     """The paper's stopping rule (section 5.2): ends the run when the successes in 100 episodes
     reach no new maximum for this many episodes; 0: never. (paper)"""
     patience_floor: Fraction = 0.5
-    """The stopping rule acts only once this fraction of 100 episodes succeeded: before learning
-    takes hold there is no maximum to wait for. ("when a certain size is satisfied"; value ours)
-    """
+    """Fraction of successes in 100 episodes before which the stopping rule waits: until learning
+    takes hold there is no maximum. ("when a certain size is satisfied"; value ours)"""
 
 
 class TransportConfig(Section):

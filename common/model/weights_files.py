@@ -1,4 +1,4 @@
-"""Weights kept in a file, with a manifest beside it; no torch here."""
+"""Weight files, each with a manifest beside it; no torch here."""
 
 import json
 from collections.abc import Mapping
@@ -10,9 +10,9 @@ from mrcdrl.common.runtime.files import atomic_write, reason, sha256
 
 
 def write_weights(path: Path, payload: bytes, manifest: Mapping[str, Any]) -> None:
-    """Keep published weights: `path` the payload, and beside it `.json` what is known of them.
+    """Write published weights to `path`, and the manifest beside it as `.json`.
 
-    Raises CheckpointError if the disk is full or the folder cannot be written.
+    Raises CheckpointError if the disk is full or the directory cannot be written.
     """
     described = {**manifest, "sha256": sha256(payload)}
     try:
@@ -25,9 +25,9 @@ def write_weights(path: Path, payload: bytes, manifest: Mapping[str, Any]) -> No
 
 
 def read_weights(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """The payload and what is known of it: {} if the file beside it is not about this payload.
+    """Read a payload and its manifest, or {} if the manifest is missing or about another payload.
 
-    Raises CheckpointError if the payload cannot be read; whether it is whole, its reader sees.
+    Raises CheckpointError if the payload cannot be read; its reader checks that it is whole.
     """
     try:
         payload = path.read_bytes()

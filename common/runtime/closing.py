@@ -1,6 +1,5 @@
 """The base of objects that close at the end of a `with` block."""
 
-from types import TracebackType
 from typing import Self
 
 
@@ -10,12 +9,7 @@ class Closing:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The metrics that a service publishes about itself, once a second."""
+"""Statistics: a service publishes its metrics once a second, and keeps its heartbeat."""
 
 import logging
 import time
@@ -14,7 +14,7 @@ from mrcdrl.common.transport import Publisher
 
 
 class StatsReporter:
-    """Publishes a service's metrics once a second, from its own main loop, and beats with it."""
+    """Publishes a service's metrics and writes its heartbeat, from the service's main loop."""
 
     def __init__(self, publisher: Publisher, role: str, worker: str) -> None:
         self._publisher = publisher
@@ -25,21 +25,21 @@ class StatsReporter:
         self._due_s = 0.0
 
     def worked(self, at_s: float | None = None) -> None:
-        """The service did something, or has nothing to do; `at_s`: then, by default now."""
+        """Note that work was done, or that there is none to do, at `at_s` (now by default)."""
         self._heartbeat.worked(at_s)
 
-    def maybe(self, metrics: Callable[[], Metrics]) -> None:
+    def publish_if_due(self, metrics: Callable[[], Metrics]) -> None:
         """Publish if a second has passed since the last time."""
         if time.monotonic() >= self._due_s:
-            self.now(metrics)
+            self.publish(metrics)
 
-    def now(self, metrics: Callable[[], Metrics]) -> None:
-        """Publish, and again in a second."""
+    def publish(self, metrics: Callable[[], Metrics]) -> None:
+        """Publish now, whether due or not."""
         self._due_s = time.monotonic() + 1.0
         try:
             text = {**self._text, "clock_ns": str(time.time_ns())}
             stats = Stats(self._role, self._worker, numbers(metrics()), text)
             self._publisher.put(encode(stats))
         except TransportError as error:
-            logging.getLogger(self._role).warning("stats not published: %s", error)
+            logging.getLogger(self._role).warning("statistics not published: %s", error)
         self._heartbeat.beat()

@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from types import TracebackType
 from typing import Self, TextIO
 
 import zenoh
@@ -110,12 +109,7 @@ class AccessLog:
         self._reader.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.dup2(self._stdout, 1)  # ends the pipe, and with it the thread
         os.close(self._stdout)
         self._reader.join()

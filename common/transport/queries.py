@@ -292,7 +292,7 @@ class Client:
         """
         parts = [payload] if isinstance(payload, Part) else payload
         length = sum(map(len, parts))
-        buffer = self._borrow(max(length, reply_bytes))
+        buffer = self._pool.borrow(max(length, reply_bytes))
         attachment = _KNOWN_FAR if self._pool.near is False else None
         if buffer is not None:
             attachment = f"slot {buffer.address}"
@@ -314,12 +314,6 @@ class Client:
             if querier is not self._querier:  # the session was replaced meanwhile
                 return self._get(handler, message, attachment)
             raise TransportError(f"cannot ask {self._whom}: {error}") from error
-
-    def _borrow(self, size: int) -> SharedBuffer | None:
-        """A buffer for a large message, or a first one to see whether the peer can open it."""
-        if size < LARGE_BYTES and self._pool.near is not None:
-            return None
-        return self._pool.borrow(size)
 
 
 def _over_network(parts: Sequence[Part], *, far: bool) -> bytes:

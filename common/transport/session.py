@@ -43,11 +43,7 @@ _CLIENT_SETTINGS: dict[str, Any] = {
     "mode": "client",
     "connect/timeout_ms": 2_000,  # for one attempt
     "connect/exit_on_failure": True,
-    "connect/retry": {
-        "period_init_ms": 200,
-        "period_max_ms": 1000,
-        "period_increase_factor": 1.5,
-    },
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "transport/link/tx/queue/size/data": 16,
@@ -153,16 +149,16 @@ class Session(Closing):
 
     def _move_to(self, fresh: zenoh.Session) -> None:
         """Declare everything on another session and close the present one; raises ZError."""
-        left, kept = fresh, self._session
+        other = fresh  # to be closed
         try:
             self._watch(fresh)
             with self._lock:
                 for declaration in self._declarations:
                     declaration.on(fresh)
-                self._session, left = fresh, kept
+                other, self._session = self._session, fresh
         finally:
             with contextlib.suppress(zenoh.ZError):
-                left.close()  # type: ignore[no-untyped-call]
+                other.close()  # type: ignore[no-untyped-call]
 
     def publisher(self, key: str) -> Publisher:
         """Publisher whose `put` blocks, rather than drops, when the link is full."""
@@ -314,10 +310,9 @@ def _check_endpoints(config: TransportConfig, endpoints: tuple[str, ...]) -> Non
 def _read(file: Path) -> zenoh.Config:
     try:
         return zenoh.Config.from_json5(file.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"config '{file}': {getattr(error, 'strerror', error)}") from error
-    except zenoh.ZError as error:
-        raise ConfigError(f"config '{file}': {_first_line(error)}") from error
+    except (OSError, UnicodeDecodeError, zenoh.ZError) as error:
+        reason = getattr(error, "strerror", None) or _first_line(error)
+        raise ConfigError(f"config '{file}': {reason}") from error
 
 
 def _router_settings(config: TransportConfig) -> dict[str, Any]:

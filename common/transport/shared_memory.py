@@ -1,8 +1,8 @@
 """Shared memory for large messages between processes of one host.
 
-A client offers its peer a shared buffer, a sealed memfd (a "slot" on the wire). The request names
-it by an address `<boot> <process> <descriptor> <token>`; the peer opens it through /proc, reads a
-large request from it, or writes a large answer into it.
+A client offers its peer a shared buffer, a sealed memfd (a "slot" on the wire), by an address
+`<boot> <process> <descriptor> <token>`. The peer opens it through /proc, reads a large request from
+it, or writes a large answer into it.
 
 Invariants: a buffer has no name in any file system, so nothing is left when either end is killed;
 only a sealed memfd of ours that begins with the token is ever mapped, and it cannot shrink under
@@ -72,8 +72,11 @@ class BufferPool:
         """Whether the peer can open them; None before its first answer."""
 
     def borrow(self, size: int) -> SharedBuffer | None:
-        """A buffer of at least `size` bytes; None if the peer is far or memory is short."""
-        if not self.enabled or self.near is False:
+        """A buffer for `size` bytes; None if they are few, the peer is far or memory is short.
+
+        The first small message gets one too, to see whether the peer can open it.
+        """
+        if not self.enabled or self.near is False or (self.near and size < LARGE_BYTES):
             return None
         for index, buffer in enumerate(self._free):
             if len(buffer.memory) >= size:

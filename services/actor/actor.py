@@ -69,7 +69,7 @@ class Actor:
         self._epsilons = self._explore(self._lease.rank)
         while not stop.is_set():
             self._advance(stop)
-        self._reporter.now(self._metrics)
+        self._reporter.publish(self._metrics)
 
     def _advance(self, stop: StopSignal) -> None:
         """Adopt newer weights, step every arena once, send the result."""
@@ -90,12 +90,12 @@ class Actor:
     def _report_waiting(self) -> None:
         self._lease.follow()
         self._reporter.worked(self._sender.heard_s)
-        self._reporter.maybe(self._metrics)
+        self._reporter.publish_if_due(self._metrics)
 
     def _report(self) -> None:
         self._lease.follow()
         self._reporter.worked()
-        self._reporter.maybe(self._metrics)
+        self._reporter.publish_if_due(self._metrics)
 
     def _adopt_newer(self) -> None:
         """Adopt newer weights; update epsilon when they or the exploration rank changed."""

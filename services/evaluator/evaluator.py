@@ -88,7 +88,7 @@ class Evaluator:
 
     def _report(self) -> None:
         self._reporter.worked()
-        self._reporter.maybe(self._metrics)
+        self._reporter.publish_if_due(self._metrics)
 
     def _metrics(self) -> EvaluatorMetrics:
         return EvaluatorMetrics(

@@ -48,10 +48,10 @@ def run(
                     for batch, update in zip(batches, updates, strict=True):
                         priorities.put(batch.keys, update.td_errors)
                 schedule.after(learner.learner_step, publisher, timer)
-            reporter.maybe(timer.metrics)
+            reporter.publish_if_due(timer.metrics)
         schedule.at_end(publisher)
     finally:
-        reporter.now(timer.metrics)
+        reporter.publish(timer.metrics)
     _LOG.info("stopped at learner step %d", learner.learner_step)
 
 

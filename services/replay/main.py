@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
                     answer_leases(lease_requests, leases)
                 if service.accepting:
                     reporter.worked()
-                reporter.maybe(service.metrics)
+                reporter.publish_if_due(service.metrics)
         finally:
             service.stop()
             if log is not None:

@@ -180,7 +180,7 @@ class SimulatedActor:
         if weights is not None:
             self.counts.update(weights=1, weights_bytes=len(weights))
         self._peers.alive()
-        self._reporter.maybe(self._metrics)
+        self._reporter.publish_if_due(self._metrics)
 
     def _spool(self, now_s: float) -> bool:
         chunk = replace(

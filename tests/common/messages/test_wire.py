@@ -379,7 +379,7 @@ _PLACES = encode(LARGE)
 
 
 def _other_place(place: int) -> bytes:
-    """LARGE with its records said to lie elsewhere."""
+    """LARGE, with another place given for its records."""
     packed = changed_map(LARGE, records=[[5, 2000], place])
     return b"".join(join_map(packed, [memoryview(LARGE.records.reshape(-1))]))
 

@@ -16,7 +16,7 @@ threading.Event().wait(float(sys.argv[2]))
 
 
 def run_stuck(deadline_s: int, lingers_s: float) -> tuple[int, str]:
-    """Exit code and output of a process told to stop that lingers."""
+    """Exit code and output of a process that lingers after it is told to stop."""
     command = [sys.executable, "-c", STUCK, str(deadline_s), str(lingers_s)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

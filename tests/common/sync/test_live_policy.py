@@ -1,4 +1,4 @@
-"""A LivePolicy acts as the run's own policy would, by the newest weights, or says why it cannot."""
+"""A LivePolicy acts as the run's own policy would, with the newest weights, or says why not."""
 
 import importlib.util
 import threading
@@ -27,7 +27,7 @@ EXAMPLE = Path(__file__).parents[3] / "examples" / "live_policy.py"
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a LivePolicy sees of a run: its configuration and its weights."""
+    """The parts of a run that a LivePolicy sees: its configuration and its weights."""
 
     endpoint: str
     config: Config
@@ -69,7 +69,7 @@ def images(step: int, num_robots: int = 2) -> UInt8Array:
 
 
 def adopted(policy: LivePolicy, version: int) -> None:
-    """Act until it acts by this version."""
+    """Act until it acts with this version."""
     pause = threading.Event()
     for _ in range(300):
         policy.act(images(0))
@@ -95,8 +95,8 @@ def test_it_acts_on_stacks_by_the_newest_weights(run: Run) -> None:
         policy.begin(np.array([1]))
         policy.act(images(6))
         stack = policy._frames.stacks
-        assert (stack[1] == images(6)[1]).all(), "the second robot has begun anew"
-        assert (stack[0, 2] == seen[5][0]).all(), "and the first has not"
+        assert (stack[1] == images(6)[1]).all(), "the second robot began again"
+        assert (stack[0, 2] == seen[5][0]).all(), "and the first did not"
         assert policy.act(images(7, num_robots=3)).shape == (3,)
 
 

@@ -1,4 +1,4 @@
-"""Whoever follows weights never sees torn or older ones, whatever comes in whatever order."""
+"""A reader never returns torn or older weights, whatever arrives in whatever order."""
 
 import time
 from concurrent.futures import Future
@@ -27,7 +27,7 @@ MESSAGES = st.tuples(
 
 
 def payload_of(epoch: int, version: int) -> bytes:
-    """Differs between any two weights."""
+    """A payload that differs between any two weights."""
     return bytes([epoch, version]) * 50
 
 

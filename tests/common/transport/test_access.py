@@ -1,4 +1,4 @@
-"""Who may send what, by configs/router.json5, with real sessions over TLS on loopback.
+"""The access rules of configs/router.json5, with real sessions over TLS on loopback.
 
 Each role tries everything, and exactly what its row allows comes through. The other side has a
 router's certificate, with which all is allowed. What comes later on the same connection, a
@@ -43,7 +43,7 @@ LIVE = {f"live {role}": RUN.live(role, "w") for role in ROLES}
 
 @dataclass(frozen=True)
 class Row:
-    """What a role may do, by the names above; all else it may not."""
+    """A role's permissions, by the names above; it may do nothing else."""
 
     put: tuple[str, ...] = ()
     follow: tuple[str, ...] = ()
@@ -103,7 +103,7 @@ def tls_endpoint() -> str:
 
 @pytest.fixture(scope="module")
 def endpoint(certificates: Path) -> Iterator[str]:
-    """Of a router that all tests here share."""
+    """The endpoint of a router that all tests here share."""
     where = tls_endpoint()
     with Session(transport(certificates, "router", listen=(where,))):
         yield where

@@ -1,4 +1,4 @@
-"""Real Zenoh sessions on loopback: every wait ends, every queue's end is as stated."""
+"""Real Zenoh sessions on loopback: every wait ends, every queue behaves as stated when full."""
 
 import socket
 import threading
@@ -517,7 +517,7 @@ def test_a_linked_router_waits_for_the_other() -> None:
 
 
 def test_a_client_whose_link_was_lost_goes_on_as_another() -> None:
-    """With all that it declared; a router may still clear away what the old link left."""
+    """Everything is declared again, while a router may still clear away the old link."""
     endpoint = free_endpoint()
     router = Session(TransportConfig(listen=(endpoint,)))
     config = TransportConfig(connect=(endpoint,), timeout_s=5.0)

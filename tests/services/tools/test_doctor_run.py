@@ -46,7 +46,7 @@ class Run:
             if request is not None:
                 request.reply(self._text)
             for reporter in list(self._reporters):
-                reporter.now(lambda: IDLE)
+                reporter.publish(lambda: IDLE)
 
     def close(self) -> None:
         self._stopping.set()
