@@ -8,9 +8,11 @@ import ctypes
 import logging
 import os
 import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import FrameType
 
 from mrcdrl.common.errors import MrcdrlError
@@ -81,6 +83,27 @@ def run_main(main: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("mrcdrl: interrupted\n")
         return 130
+
+
+def start_service(
+    role: str, flags: Sequence[str], log: Path, environment: Mapping[str, str]
+) -> "subprocess.Popen[bytes]":
+    """Start a service in its own session, its output appended to the log; it ends with us."""
+    with log.open("ab") as output:
+        return subprocess.Popen(
+            [*COMMAND, role, *flags],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            env={**environment, DIE_WITH_PARENT: str(os.getpid())},
+            start_new_session=True,
+        )
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log, usually the reason why its service ended."""
+    lines = log.read_text("utf-8", "replace").strip().splitlines()
+    return lines[-1] if lines else "its log is empty"
 
 
 def available_cores() -> int:

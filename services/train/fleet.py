@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mrcdrl.common.config import ENV_PREFIX
 from mrcdrl.common.errors import DivergedError, MrcdrlError
-from mrcdrl.common.runtime.process import ALLOCATOR, COMMAND, DIE_WITH_PARENT
+from mrcdrl.common.runtime.process import ALLOCATOR, last_line, start_service
 
 _LOG = logging.getLogger("train")
 _TERM_S = 20.0  # a process that was asked to stop is killed after this
@@ -39,23 +39,12 @@ class ManagedProcess:
     log_read: int = 0  # bytes of the log searched for warnings
 
     def start(self) -> None:
-        command = [*COMMAND, self.role, *self.arguments]
-        environment = {**ALLOCATOR, **resolved_environment(), DIE_WITH_PARENT: str(os.getpid())}
-        with self.log_path.open("ab") as log:
-            self.popen = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env=environment,
-                start_new_session=True,
-            )
+        environment = {**ALLOCATOR, **resolved_environment()}
+        self.popen = start_service(self.role, self.arguments, self.log_path, environment)
         self.started_s = time.monotonic()
 
     def last_line(self) -> str:
-        """The last line of its log, usually the reason for its end."""
-        lines = self.log_path.read_text("utf-8", "replace").strip().splitlines()
-        return lines[-1] if lines else "its log is empty"
+        return last_line(self.log_path)
 
 
 class Fleet:

@@ -1,1 +1,1 @@
-"""Many actors as replay sees them, without arenas and inference."""
+"""Simulates many actors as replay sees them, without arenas and inference."""

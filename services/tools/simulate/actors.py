@@ -1,9 +1,9 @@
-"""Actors without arena and inference: what they put on the wire is real, what is in it is not.
+"""Actors without arenas and inference: their messages are real, the contents are made up.
 
-Each simulated actor has what a real one has there: two sessions, a liveliness token, a `Sender`
-with its thread, a subscription to the weights, statistics once a second, a summary of each
-episode. Invariants: a full spool stops an actor's clock, as it stops arenas; a process that runs
-them ends when its parent does.
+Each simulated actor has the network side of a real one: two sessions, a liveliness token, a
+`Sender` with its thread, a subscription to the weights, statistics once a second, a summary of each
+episode. Invariants: a full spool stops an actor's clock, as it stops arenas; a process of simulated
+actors ends when its parent does.
 """
 
 import signal
@@ -42,16 +42,16 @@ from mrcdrl.services.actor.sender import Sender
 from mrcdrl.services.replay.client import ReplayWriter, shard_of
 
 EPISODE_FRAMES = 186  # mean of benchmarks/results/quick-2robots
-_EPISODES = 8  # different ones; then they come again
+_EPISODES = 8  # different ones, then they repeat
 _TICK_S = 0.01
-_TELL_S = 1.0
+_TALLY_S = 1.0
 BEGIN, STOP = "begin", "stop"
 _NOT_SIMULATED = read(ActorMetrics, {})  # 0 for every metric
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a process is to simulate."""
+    """What a process simulates."""
 
     config: Config
     run: str
@@ -66,7 +66,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What a process did since it began, and how long the inserts since its last tally took."""
+    """A process's counts since it began, and its insert latencies since the last tally."""
 
     seconds: float = 0.0  # since it began
     counts: Counter[str] = field(default_factory=Counter)
@@ -74,35 +74,35 @@ class Tally:
     last: bool = False
 
 
-class Party(Protocol):
-    """Whoever a process simulates."""
+class Simulated(Protocol):
+    """What a process simulates: its actors, or the learner."""
 
     def begin(self, now_s: float) -> None: ...
     def work(self, now_s: float) -> None: ...
     def done(self) -> tuple[Counter[str], Float64Array]: ...
 
 
-def follow(connection: Connection, party: Party) -> None:
-    """Work from the parent's word to its next, and tell it once a second what was done.
+def follow(connection: Connection, simulated: Simulated) -> None:
+    """Work from the parent's first message to its second, sending a tally once a second.
 
-    A parent that is gone has said the last word.
+    Raises EOFError when the parent ends.
     """
     connection.send(Tally())
     connection.recv()
-    began_s = told_s = monotonic()
-    party.begin(began_s)
+    began_s = sent_s = monotonic()
+    simulated.begin(began_s)
     while not connection.poll(_TICK_S):
-        party.work(monotonic())
-        if monotonic() - told_s >= _TELL_S:
-            told_s = monotonic()
-            connection.send(Tally(told_s - began_s, *party.done()))
+        simulated.work(monotonic())
+        if monotonic() - sent_s >= _TALLY_S:
+            sent_s = monotonic()
+            connection.send(Tally(sent_s - began_s, *simulated.done()))
     connection.recv()
-    connection.send(Tally(monotonic() - began_s, *party.done(), last=True))
+    connection.send(Tally(monotonic() - began_s, *simulated.done(), last=True))
 
 
 @contextmanager
 def answering(connection: Connection) -> Iterator[None]:
-    """Ctrl-C is for the parent, which is told in a line what went wrong."""
+    """Ignore Ctrl-C, which is for the parent; send the parent an error as one line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
@@ -113,7 +113,7 @@ def answering(connection: Connection) -> Iterator[None]:
 
 
 def act(plan: Plan, connection: Connection) -> None:
-    """A process's simulated actors, until the parent says stop."""
+    """Run a process's simulated actors until the parent sends STOP."""
     with answering(connection), ExitStack() as owned:
         actors = SimulatedActors(plan)
         owned.callback(actors.close)
@@ -121,7 +121,7 @@ def act(plan: Plan, connection: Connection) -> None:
 
 
 class TimedWriter(ReplayWriter):
-    """Notes how long an acknowledgement took, from the first asking on."""
+    """Records how long each acknowledgement took, counted from the first request."""
 
     def __init__(self, session: Session, plan: Plan, worker: str, stop: StopSignal) -> None:
         warn_s, num_shards = plan.config.actor.warn_s, plan.config.replay.shards
@@ -140,7 +140,7 @@ class TimedWriter(ReplayWriter):
 
 
 class SimulatedActor:
-    """One actor as replay, router and learner see it."""
+    """One actor, as replay, router and learner see it."""
 
     def __init__(
         self,
@@ -169,11 +169,11 @@ class SimulatedActor:
         self.sender = Sender(writer, config.actor.spool_chunks)
 
     def begin(self, now_s: float, phase: float) -> None:
-        """phase: 0 to 1, of a chunk's time until the first is due."""
+        """Start the clock. phase: time to the first chunk, as a fraction of a chunk's time."""
         self._due_s = now_s + phase * len(self._chunks[0]) / self._rate
 
     def work(self, now_s: float) -> None:
-        """Spool the chunks that are due, take the weights that came, tell."""
+        """Spool the chunks that are due, take new weights, publish statistics."""
         while self._due_s <= now_s and self._spool(now_s):
             pass
         weights = self._weights.take()
@@ -228,10 +228,10 @@ class SimulatedActor:
 
 
 class SimulatedActors:
-    """All of one process, worked by one thread, beside a thread of each one's sender."""
+    """All simulated actors of one process: one thread for all, and one for each sender."""
 
     def __init__(self, plan: Plan) -> None:
-        """Raises EndpointError where nobody answers."""
+        """Join the run; raises EndpointError if the endpoint does not answer."""
         self._stop, self._sessions = StopSignal(), ExitStack()
         self._actors: list[SimulatedActor] = []
         chunks = episode_chunks(plan.config)
@@ -261,14 +261,16 @@ class SimulatedActors:
             counts.update(actor.counts)
             counts.update(transitions=sender.transitions, chunks=sender.chunks)
             counts.update(
-                requests=writer.requests, held=writer.throttled, unanswered=writer.unanswered
+                requests=writer.requests,
+                throttled=writer.throttled,
+                unanswered=writer.unanswered,
             )
             counts.update(waited_ms=round(1000 * actor.waited_s))
             insert_s += [writer.insert_s.popleft() for _ in range(len(writer.insert_s))]
         return counts, np.array(insert_s)
 
     def close(self) -> None:
-        """End all; what is spooled is dropped."""
+        """End all actors; spooled chunks are dropped."""
         self._stop.set()
         with ThreadPoolExecutor(max(1, len(self._actors))) as pool:
             list(pool.map(lambda actor: actor.sender.close(), self._actors))
@@ -276,20 +278,9 @@ class SimulatedActors:
 
 
 def episode_chunks(config: Config) -> list[Chunk]:
-    """The chunks of a few episodes of a robot, of random steps but true shapes and lengths."""
+    """Chunks of a few episodes of one robot: random steps, but real shapes and lengths."""
     rng, numbers = np.random.default_rng(0), count()
-    chunker = Chunker(
-        ChunkerConfig(
-            actor="simulated",
-            incarnation=0,
-            gamma=config.agent.gamma,
-            n_step=config.agent.n_step,
-            stack=config.arena.stack,
-            chunk_length=config.actor.chunk_length,
-            prioritized=config.replay.prioritized,
-            reward_scale=config.agent.reward_scale,
-        )
-    )
+    chunker = Chunker(ChunkerConfig.from_config(config, "simulated", incarnation=0))
     chunks: list[Chunk] = []
     for _ in range(_EPISODES):
         chunker.start(_record(config, rng))
@@ -310,7 +301,7 @@ def episode_chunks(config: Config) -> list[Chunk]:
 
 
 def _record(config: Config, rng: np.random.Generator) -> UInt8Array:
-    """Poses anywhere in the arena, or a grey image with a block of noise on a tenth of it."""
+    """A record of random poses, or an image of one intensity with noise on a tenth of it."""
     length = config.arena.record_bytes
     if config.arena.codec == "scene":
         poses = rng.uniform(0, config.arena.size_px, length // 4).astype("<f4")

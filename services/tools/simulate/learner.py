@@ -1,4 +1,4 @@
-"""A learner that computes nothing: weights of the true size, and mini-batches drawn and dropped."""
+"""A learner that computes nothing: publishes weights of real size, drops the batches it samples."""
 
 import threading
 from collections import Counter
@@ -19,7 +19,7 @@ from mrcdrl.services.tools.simulate.actors import Plan, answering, follow
 
 
 def learn(plan: Plan, connection: Connection) -> None:
-    """A process's simulated learner, until the parent says stop."""
+    """Run a process's simulated learner until the parent sends STOP."""
     with answering(connection), ExitStack() as owned:
         session = owned.enter_context(Session(plan.transport))
         bulk = owned.enter_context(Session(plan.transport))
@@ -29,8 +29,7 @@ def learn(plan: Plan, connection: Connection) -> None:
 
 
 class SimulatedLearner:
-    """Publishes `plan.rate` times a second; draws as fast as replay's limiter lets it, if it has
-    one."""
+    """Publishes `plan.rate` times a second; samples as fast as replay's limiter allows, if any."""
 
     def __init__(self, plan: Plan, session: Session, bulk: Session) -> None:
         config, keys = plan.config, plan.keys
@@ -40,7 +39,7 @@ class SimulatedLearner:
         self._payload = weights_to_bytes(network, SENT_AS[config.learner.publish_precision])
         self._period_s = 1 / plan.rate if plan.rate else float("inf")
         self._due_s, self._epoch, self._version = 0.0, time_ns(), 0
-        self._samples = 0
+        self._num_samples = 0
         self._stop = StopSignal()
         session.announce(keys.live("learner", plan.workers[0]))
         self._weights = WeightsWriter(session, keys)
@@ -50,23 +49,23 @@ class SimulatedLearner:
             if config.replay.prioritized
             else None
         )
-        self._draws = config.replay.samples_per_insert > 0
-        self._thread = threading.Thread(target=self._draw, name="draw")
+        self._samples = config.replay.samples_per_insert > 0
+        self._thread = threading.Thread(target=self._sample, name="sample")
 
     def begin(self, now_s: float) -> None:
         self._due_s = now_s + self._period_s
-        if self._draws:
+        if self._samples:
             self._thread.start()
 
     def work(self, now_s: float) -> None:
-        """Publish if it is time; what is late by then is left out, as a learner does."""
+        """Publish if it is due; late publications are skipped, as a learner skips them."""
         if now_s >= self._due_s:
             self._due_s += self._period_s
             self._version += 1
             self._weights.publish(Weights.of(self._epoch, self._version, 0, self._payload))
 
     def done(self) -> tuple[Counter[str], Float64Array]:
-        return Counter(published=self._version, samples=self._samples), np.empty(0)
+        return Counter(published=self._version, samples=self._num_samples), np.empty(0)
 
     def close(self) -> None:
         self._stop.set()
@@ -74,10 +73,10 @@ class SimulatedLearner:
             self._thread.join()
         self._weights.close()
 
-    def _draw(self) -> None:
+    def _sample(self) -> None:
         rng = np.random.default_rng(0)
         while (samples := self._reader.sample()) is not None:
-            self._samples += len(samples)
+            self._num_samples += len(samples)
             if self._priorities is not None:
                 errors = rng.lognormal(0, 1, len(samples)).astype(np.float32)
                 self._priorities.update(Priorities(samples.keys, errors))

@@ -1,6 +1,6 @@
-"""What a load cost, and what would have to be more for it to be larger, in words.
+"""The cost of a load, and the bottleneck that keeps it from being larger.
 
-Invariants: pure, save for what is read in /proc; where the system has no /proc, figures are None.
+Invariants: pure, except for readings from /proc; these are None on systems without /proc.
 """
 
 import math
@@ -12,25 +12,25 @@ import numpy as np
 
 from mrcdrl.common.messages.trajectory import Float64Array
 
-_FULL = 0.9  # of a core, from which a process counts as filling it
+_FULL = 0.9  # of a core, above which a process fills it
 _BUSY = 0.95  # of all cores
-_HELD = 0.2  # of replay's reports
-_TAKEN = 0.95  # of what was due
+_THROTTLED = 0.2  # of replay's reports
+_ACCEPTED = 0.95  # of what was due
 _NANO = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Usage:
-    """What a process has used since it started."""
+class Reading:
+    """Resources that a process has used since it started."""
 
     cpu_s: float
-    waited_s: float  # ready to run, without a core
-    memory_mib: float  # its proportional share of what it shares
+    waited_s: float  # ready to run, waiting for a core
+    memory_mib: float  # proportional set size
     threads: int
 
     @classmethod
-    def of(cls, pid: int) -> "Usage | None":
-        """None where the process is gone, or the system does not say."""
+    def of(cls, pid: int) -> "Reading | None":
+        """Read /proc; None if the process has ended or the system does not provide it."""
         folder = Path(f"/proc/{pid}")
         try:
             threads = [
@@ -50,8 +50,8 @@ class Usage:
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
-    """What a process used of the machine over some time."""
+class Usage:
+    """Resources that a process used over a period."""
 
     cores: float
     waited_cores: float
@@ -59,7 +59,7 @@ class Share:
     threads: int
 
     @classmethod
-    def between(cls, first: Usage, last: Usage, seconds: float) -> "Share":
+    def between(cls, first: Reading, last: Reading, seconds: float) -> "Usage":
         return cls(
             round((last.cpu_s - first.cpu_s) / seconds, 3),
             round((last.waited_s - first.waited_s) / seconds, 3),
@@ -69,7 +69,7 @@ class Share:
 
 
 def busy_cores() -> float | None:
-    """Seconds that the cores this process may use have worked, whoever for, since they started."""
+    """Busy seconds, for any process, of the cores this process may use, since boot."""
     try:
         lines = Path("/proc/stat").read_text("ascii").splitlines()
         ours = {f"cpu{core}" for core in os.sched_getaffinity(0)}
@@ -77,17 +77,17 @@ def busy_cores() -> float | None:
     except (OSError, AttributeError):
         return None
     counted = [line.split() for line in lines if line.split()[0] in ours]
-    idle = (4, 5)  # idle and waiting for a disk; 9 and 10, of guests, are in 1 and 2 already
+    idle = (4, 5)  # idle and waiting for a disk; guests' 9 and 10 are included in 1 and 2
     return tick_s * sum(
         int(ticks)
         for words in counted
-        for place, ticks in enumerate(words[:9])
-        if place and place not in idle
+        for column, ticks in enumerate(words[:9])
+        if column and column not in idle
     )
 
 
 def latency(seconds: Float64Array) -> dict[str, float | None]:
-    """Milliseconds: median, 99th percentile, longest; null where there were none."""
+    """Median, 99th percentile and maximum in milliseconds; None without values."""
     if not len(seconds):
         return {"p50": None, "p99": None, "max": None}
     figures = np.quantile(seconds * 1000, [0.5, 0.99, 1.0])
@@ -98,34 +98,34 @@ def latency(seconds: Float64Array) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """The figures that a limit is told from."""
+    """The figures that show the bottleneck."""
 
-    due: float  # transitions per second; infinite where actors made as many as were taken
-    taken: float
-    held: float  # share of replay's reports in which its limiter held an insert
+    due: float  # transitions per second; infinite if actors make as many as are accepted
+    accepted: float
+    throttled: float  # fraction of replay's reports in which its limiter throttled an insert
     insert_ms: float | None  # median
     cores: int
-    busy: float | None  # of them, whoever for
-    shares: dict[str, Share]  # by process; "actors-0" and so on are simulated ones
+    busy: float | None  # of these cores, for any process
+    usage: dict[str, Usage]  # by process; actors-0 and so on simulate
 
 
 def first_limit(load: Load) -> str:
-    """What kept more from being taken."""
-    if math.isfinite(load.due) and load.taken >= _TAKEN * load.due:
-        return "none: all that was due was taken"
-    if load.held > _HELD:
-        return "the rate limiter: the learner does not draw enough for more to be let in"
-    largest = max(load.shares, key=lambda name: load.shares[name].cores, default=None)
+    """Name the bottleneck."""
+    if math.isfinite(load.due) and load.accepted >= _ACCEPTED * load.due:
+        return "none: all transitions due were accepted"
+    if load.throttled > _THROTTLED:
+        return "the rate limiter: the learner does not sample enough to admit more"
+    largest = max(load.usage, key=lambda name: load.usage[name].cores, default=None)
     if load.busy is not None and load.busy >= _BUSY * load.cores:
-        used = ", ".join(f"{name} {share.cores:.2f}" for name, share in load.shares.items())
-        ours = sum(share.cores for share in load.shares.values())
+        used = ", ".join(f"{name} {usage.cores:.2f}" for name, usage in load.usage.items())
+        ours = sum(usage.cores for usage in load.usage.values())
         others = max(load.busy - ours, 0.0)
         return f"the machine's {load.cores} cores: {used}, all others {others:.2f}"
-    if largest is not None and load.shares[largest].cores >= _FULL:
-        share = load.shares[largest].cores
+    if largest is not None and load.usage[largest].cores >= _FULL:
+        cores = load.usage[largest].cores
         if largest.startswith("actors"):
-            return f"the simulation: {largest} fills its core ({share:.2f}); give --processes more"
-        return f"{largest}: it fills a core ({share:.2f})"
+            return f"the simulation: {largest} fills its core ({cores:.2f}); raise --processes"
+        return f"{largest}: it fills a core ({cores:.2f})"
     if load.insert_ms is None:
         return "replay did not acknowledge anything"
-    return f"the way to replay and back: an acknowledgement takes {load.insert_ms:.1f} ms"
+    return f"the round trip to replay: an acknowledgement takes {load.insert_ms:.1f} ms"

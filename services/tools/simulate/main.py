@@ -1,7 +1,7 @@
-"""`mrcdrl simulate`: the load of many actors on replay, without arenas and inference.
+"""`mrcdrl simulate`: put the load of many actors on replay, without arenas and inference.
 
-Invariant: a run that is joined bears a name that says what its data are, unless --force says that
-they may spoil it.
+Invariant: a run that is joined has a name that marks its data as made up, unless --force allows
+them to spoil it.
 """
 
 import argparse
@@ -23,13 +23,13 @@ from mrcdrl.services.monitor.summary import machine
 from mrcdrl.services.tools.simulate.simulation import Demand, simulation
 from mrcdrl.services.tools.simulate.target import NAME, joined, own
 
-ROBOT_STEPS_PER_S = 4300.0  # of an actor that has a core of its own: docs/profile.md
-_FILES = 4  # of an actor, open in its process and in replay or the router: both have two ends
+ROBOT_STEPS_PER_S = 4300.0  # of an actor with a dedicated core: docs/profile.md
+_FILES = 4  # open files per actor, both here and in replay or the router: two connections' ends
 _SPARE_FILES = 200
 
 
 def main(argv: Sequence[str]) -> int:
-    """Simulate; the exit code. The figures are a line of JSON; what goes on is told on stderr."""
+    """Simulate; return the exit code. Figures go to stdout as JSON, progress to stderr."""
     arguments = _parse(argv)
     _allow_open_files(arguments.actors)
     stop = StopSignal().listen()
@@ -63,19 +63,21 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         "--rate",
         type=lambda text: math.inf if text == "max" else _positive(text),
         default=ROBOT_STEPS_PER_S,
-        help="robot steps per second of each actor, or max: as many as are acknowledged; by "
-        f"default {ROBOT_STEPS_PER_S:g}, what one makes that has a core of its own",
+        help="robot steps per second of each actor, or max: as many as are acknowledged; "
+        f"default: {ROBOT_STEPS_PER_S:g}, those of an actor with a dedicated core",
     )
-    parser.add_argument("--processes", type=_count, help="that actors share; by default one a core")
     parser.add_argument(
-        "--publications", type=_frequency, help="of weights per second; by default 1"
+        "--processes", type=_count, help="processes that hold the actors; default: one per core"
     )
-    parser.add_argument("--router", action="store_true", help="put one before replay")
-    parser.add_argument("--config", help=f"a preset or a TOML file; by default {DEFAULT_PRESET}")
+    parser.add_argument(
+        "--publications", type=_frequency, help="of weights, per second; default: 1"
+    )
+    parser.add_argument("--router", action="store_true", help="put a router in front of replay")
+    parser.add_argument("--config", help=f"a preset or a TOML file; default: {DEFAULT_PRESET}")
     parser.add_argument("--run", help=f"join this run instead; its name begins with {NAME}")
-    parser.add_argument("--connect", help="where it is, such as tcp/127.0.0.1:7447")
+    parser.add_argument("--connect", help="the run's endpoint, such as tcp/127.0.0.1:7447")
     parser.add_argument(
-        "--force", action="store_true", help="join any run, whose learner learns what is made up"
+        "--force", action="store_true", help="join any run; its learner then trains on made-up data"
     )
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
@@ -90,16 +92,16 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _check_joining(parser: Parser, arguments: argparse.Namespace) -> None:
-    """Refuse what the run settles itself, and a run that is for something else."""
+    """Refuse flags that the run decides, and runs that are not meant for made-up data."""
     check_name(arguments.run, "run name")
     settled = [f"--{name}" for name in ("config", "router") if getattr(arguments, name)]
     settled += ["--publications"] * (arguments.publications is not None)
     settled += [f"--{n}" for n in overrides(arguments) if not n.startswith("transport.")]
     if settled:
-        parser.error(f"{settled[0]} is settled by the run: not with --connect")
+        parser.error(f"{settled[0]} is set by the run: not allowed with --connect")
     if not (arguments.run.startswith(NAME) or arguments.force):
         parser.error(
-            f"run {arguments.run!r} would learn what is made up; give a run whose name begins "
+            f"run {arguments.run!r} would train on made-up data; give a run whose name begins "
             f"with {NAME!r}, or --force"
         )
 
@@ -107,14 +109,14 @@ def _check_joining(parser: Parser, arguments: argparse.Namespace) -> None:
 def _count(text: str) -> int:
     number = int(text)
     if number < 1:
-        raise argparse.ArgumentTypeError(f"{text}: at least 1")
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
     return number
 
 
 def _positive(text: str) -> float:
     number = float(text)
     if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: a number above 0")
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0")
     return number
 
 
@@ -123,15 +125,15 @@ def _frequency(text: str) -> float:
 
 
 def _allow_open_files(actors: int) -> None:
-    """As many as all sessions need, here and in the processes started from here.
+    """Raise the limit of open files to what all sessions need, for the processes started here too.
 
-    Raises ConfigError where the system gives fewer.
+    Raises ConfigError if the system allows fewer.
     """
     needed = _FILES * actors + _SPARE_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if needed > hard != resource.RLIM_INFINITY:
         raise ConfigError(
-            f"{actors} actors need {needed} open files, and the system allows {hard}: raise that "
+            f"{actors} actors need {needed} open files, but the system allows {hard}: raise that "
             "(ulimit -Hn), or simulate fewer"
         )
     if needed > soft != resource.RLIM_INFINITY:

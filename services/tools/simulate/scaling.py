@@ -1,8 +1,8 @@
-"""What a run of many actors would ask of replay, router and network: a model of measured costs.
+"""A model of what many actors demand of replay, router and network, from measured costs.
 
-Invariants: pure; sizes are those of real messages, encoded; costs are measured ones, of the runs
-that benchmarks/results/simulate/README.md names. docs/generate.py writes the tables of
-docs/scaling.md by it.
+Invariants: pure; sizes are those of real encoded messages; costs were measured in the runs that
+benchmarks/results/simulate/README.md names. docs/generate.py makes the tables of docs/scaling.md
+from it.
 """
 
 import math
@@ -33,24 +33,24 @@ from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import SENT_AS, weights_to_bytes
 from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
 
-# Processor seconds of replay's process, Zenoh's threads in it included, for
+# CPU seconds of replay's process, including Zenoh's threads, for
 INSERT_S = 0.36e-3  # a request to insert
 CHUNK_S = 0.06e-3  # each chunk in it
 SAMPLE_S = 0.41e-3  # a request for 128 transitions
 PAYLOAD_S = 1.4e-9  # a byte of records that crosses the network
-STATS_S = 0.13e-3  # a message of statistics, all else that an idle actor costs included
-# and of whoever relays, the router, or replay where it is the router, for
-RELAYED_BYTE_S = 0.58e-9  # a byte of weights, sent to one of many
+STATS_S = 0.13e-3  # a statistics message, including everything else that an idle actor costs
+# and of the process that relays (the router, or replay if there is none), for
+RELAYED_BYTE_S = 0.58e-9  # a byte of weights, per receiver
 RELAYED_QUERY_S = 0.14e-3  # a request and its answer
 
-CORE = 0.9  # of a core, that one Python process can use
-LINK_BYTES = 1.25e9 * 0.8  # per second, 10 Gbit/s used to four fifths
+CORE = 0.9  # fraction of a core that one Python process can use
+LINK_BYTES = 1.25e9 * 0.8  # per second: four fifths of 10 Gbit/s
 EVALUATORS = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """Messages of one kind, of all actors together."""
+    """Messages of one kind, for all actors together."""
 
     name: str
     way: str
@@ -63,7 +63,7 @@ class Flow:
 
     @property
     def processor(self) -> tuple[str, float] | None:
-        """Whose, and seconds a message; None: not measured by itself, or next to nothing."""
+        """The process that pays, and its CPU seconds per message; None: negligible or unknown."""
         return {
             "chunks": ("replay", INSERT_S + CHUNK_S),
             "samples": ("replay", SAMPLE_S),
@@ -74,7 +74,7 @@ class Flow:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast a run goes."""
+    """The rates of a run."""
 
     actors: int
     transitions_per_s: float  # of all actors
@@ -82,34 +82,34 @@ class Pace:
 
     @classmethod
     def free(cls, actors: int, rate: float, publications_per_s: float = 1.0) -> "Pace":
-        """Nobody waits for the learner; `rate`: robot steps per second of an actor."""
+        """Actors do not wait for the learner. rate: robot steps per second of an actor."""
         return cls(actors, actors * rate, publications_per_s)
 
     @classmethod
     def throttled(cls, config: Config, actors: int, rate: float, updates_per_s: float) -> "Pace":
-        """The rate limiter lets in what the learner's updates draw."""
-        drawn = updates_per_s * config.learner.batch_size / config.replay.samples_per_insert
+        """The rate limiter admits as much as the learner's updates sample."""
+        admitted = updates_per_s * config.learner.batch_size / config.replay.samples_per_insert
         learner = config.learner
         publications_per_s = updates_per_s / learner.publish_period
         if learner.publish_interval_s:
             publications_per_s = min(publications_per_s, 1 / learner.publish_interval_s)
-        return cls(actors, min(drawn, actors * rate), publications_per_s)
+        return cls(actors, min(admitted, actors * rate), publications_per_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """What that would ask for."""
+    """The resources that a pace needs."""
 
     replay_cores: float
     relay_cores: float
     relay_bytes_per_s: float  # through the router
     shards: int
     routers: int
-    first: str  # what is full first, where there is one of each
+    first: str  # what fills up first, with one of each
 
 
 def flows(config: Config, pace: Pace) -> list[Flow]:
-    """Everything that crosses between actors, replay and learner, without repeats."""
+    """All messages between actors, replay and learner, without retransmissions."""
     chunk_bytes, chunk_length = _chunk(config)
     chunks_per_s = pace.transitions_per_s / chunk_length
     samples_per_s = pace.transitions_per_s * config.replay.samples_per_insert
@@ -123,8 +123,8 @@ def flows(config: Config, pace: Pace) -> list[Flow]:
              chunks_per_s),
         Flow("weights", "learner → actors", weights_bytes(config),
              pace.publications_per_s * listeners),
-        Flow("statistics", "actor → who watches", _size(_stats()), pace.actors),
-        Flow("episodes", "actor → who watches", _size(_episode()), episodes_per_s),
+        Flow("statistics", "actor → watchers", _size(_stats()), pace.actors),
+        Flow("episodes", "actor → watchers", _size(_episode()), episodes_per_s),
         Flow("sample requests", "learner → replay", _size(request), samples_per_s / size),
         Flow("samples", "replay → learner", _size(samples), samples_per_s / size),
     ]  # fmt: skip
@@ -140,12 +140,12 @@ def flows(config: Config, pace: Pace) -> list[Flow]:
 
 
 def need(config: Config, pace: Pace) -> Need:
-    """What has to be there for it, one chunk a request, all on hosts of their own."""
+    """Resources for this pace, with one chunk per request and every process on its own host."""
     by_name = {flow.name: flow for flow in flows(config, pace)}
     chunks, samples = by_name["chunks"], by_name["samples"]
-    drawn = config.learner.sample_size * samples.per_s
+    sampled = config.learner.sample_size * samples.per_s
     replay_cores = PAYLOAD_S * (chunks.bytes_per_s + samples.bytes_per_s) + replay_cpu(
-        inserts=chunks.per_s, chunks=chunks.per_s, samples=drawn
+        inserts=chunks.per_s, chunks=chunks.per_s, samples=sampled
     )
     relay_cores = relay_cpu(
         pace.actors, by_name["weights"].bytes_per_s, queries=chunks.per_s + samples.per_s
@@ -168,18 +168,21 @@ def need(config: Config, pace: Pace) -> Need:
 
 
 def replay_cpu(*, inserts: float, chunks: float, samples: float) -> float:
-    """Cores for so many requests to insert, chunks in them and transitions drawn a second."""
+    """Cores for this many insert requests, chunks in them, and transitions sampled per second."""
     return inserts * INSERT_S + chunks * CHUNK_S + samples / 128 * SAMPLE_S
 
 
 def relay_cpu(actors: int, weights_bytes_per_s: float, *, queries: float) -> float:
-    """Cores to pass on the actors' statistics, the weights to each of them, and queries."""
+    """Cores to relay the actors' statistics, the weights to each actor, and queries."""
     passed = weights_bytes_per_s * RELAYED_BYTE_S + queries * RELAYED_QUERY_S
     return actors * STATS_S + passed
 
 
 def expected(figures: Mapping[str, Any]) -> float:
-    """Cores of replay, which relays as well, by the model, for what `mrcdrl simulate` printed."""
+    """Cores of replay by the model, for figures that `mrcdrl simulate` printed.
+
+    Relaying is included, unless a router did it.
+    """
     worked = replay_cpu(
         inserts=figures["inserts_per_s"],
         chunks=figures["chunks_per_s"],
@@ -194,7 +197,7 @@ def expected(figures: Mapping[str, Any]) -> float:
 
 @cache
 def weights_bytes(config: Config) -> int:
-    """Of one publication."""
+    """Size of one publication of weights."""
     network = QNetwork(config.agent.kind, stack=config.arena.stack, view_px=config.arena.view_px)
     payload = weights_to_bytes(network, SENT_AS[config.learner.publish_precision])
     return _size(Weights.of(2**60, 10**5, 10**6, payload))
@@ -206,7 +209,7 @@ def _payload_s(flow: Flow) -> float:
 
 @cache
 def _chunk(config: Config) -> tuple[float, float]:
-    """Bytes and transitions of a chunk, on average."""
+    """Mean bytes and transitions of a chunk."""
     chunks = episode_chunks(config)
     return fmean(map(_size, chunks)), fmean(map(len, chunks))
 

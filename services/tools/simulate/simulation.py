@@ -1,7 +1,7 @@
-"""The processes of a simulation: started, let work together, listened to, summed up.
+"""Starts the processes of a simulation, lets them work together, and sums up their figures.
 
-Invariants: the clock runs from when all have joined; a process that fails ends the simulation,
-with its reason; all have ended when the block is left.
+Invariants: the clock starts when all have joined; a process that fails ends the simulation with its
+error; all have ended when the block is left.
 """
 
 import math
@@ -26,29 +26,36 @@ from mrcdrl.common.runtime.process import StopSignal, available_cores
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.simulate.actors import BEGIN, STOP, Plan, Tally, act, episode_chunks
-from mrcdrl.services.tools.simulate.load import Load, Share, Usage, busy_cores, first_limit, latency
+from mrcdrl.services.tools.simulate.load import (
+    Load,
+    Reading,
+    Usage,
+    busy_cores,
+    first_limit,
+    latency,
+)
 from mrcdrl.services.tools.simulate.target import Target
 
 _JOIN_S = 120.0
 _END_S = 60.0
 _TICK_S = 0.2
 _LINE_S = 1.0  # between lines on a terminal
-_PLAIN_S = 10.0  # and elsewhere
+_PLAIN_S = 10.0  # otherwise
 Work = Callable[[Plan, Connection], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What is to be simulated."""
+    """The load to simulate."""
 
     actors: int
-    rate: float  # robot steps per second of each; infinite: as many as are acknowledged
-    processes: int  # that they share
+    rate: float  # robot steps per second and actor; infinite: as many as are acknowledged
+    processes: int  # that hold the actors
     publications: float | None  # of weights, per second; None: no learner
 
 
 class Worker:
-    """A process that simulates, and what it told."""
+    """A process that simulates, and its tallies so far."""
 
     def __init__(self, name: str, work: Work, plan: Plan) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -71,26 +78,26 @@ class Worker:
         self._connection.send(word)
 
     def hear(self) -> Tally:
-        """Its next tally, waited for; raises MrcdrlError with what went wrong there."""
+        """Wait for its next tally; raises MrcdrlError with the reason if it failed."""
         if not self._connection.poll(_JOIN_S):
-            raise MrcdrlError(f"{self.name} said nothing for {_JOIN_S:g} s")
+            raise MrcdrlError(f"no message from {self.name} for {_JOIN_S:g} s")
         try:
-            said = self._connection.recv()
+            message = self._connection.recv()
         except (EOFError, ConnectionError) as error:
             raise MrcdrlError(f"{self.name} ended; its error is above") from error
-        if not isinstance(said, Tally):
-            raise MrcdrlError(f"{self.name}: {said}")
-        self.seconds, self.counts = said.seconds or math.inf, said.counts
-        self.insert_s.append(said.insert_s)
-        return said
+        if not isinstance(message, Tally):
+            raise MrcdrlError(f"{self.name}: {message}")
+        self.seconds, self.counts = message.seconds or math.inf, message.counts
+        self.insert_s.append(message.insert_s)
+        return message
 
     def drain(self) -> None:
-        """Hear what it has said by now."""
+        """Read all tallies that have arrived."""
         while self._connection.poll():
             self.hear()
 
     def close(self) -> None:
-        """Without a parent to listen to, it ends."""
+        """Close the connection, which ends the process."""
         self._connection.close()
         self._process.join(_END_S)
         if self._process.is_alive():
@@ -100,9 +107,9 @@ class Worker:
 
 @contextmanager
 def simulation(demand: Demand, target: Target, name: str) -> Iterator["Simulation"]:
-    """All processes started and joined to the run, waiting to begin; `name` begins the actors'."""
+    """Start all processes and wait until they have joined; `name` prefixes the actors' names."""
     actors = [f"{name}-{index}" for index in range(demand.actors)]
-    shares = [tuple(actors[i :: demand.processes]) for i in range(demand.processes)]
+    groups = [tuple(actors[i :: demand.processes]) for i in range(demand.processes)]
     with ExitStack() as owned:
 
         def start(title: str, work: Work, who: tuple[str, ...], rate: float) -> Worker:
@@ -111,7 +118,7 @@ def simulation(demand: Demand, target: Target, name: str) -> Iterator["Simulatio
             owned.callback(worker.close)
             return worker
 
-        workers = [start(f"actors-{i}", act, who, demand.rate) for i, who in enumerate(shares)]
+        workers = [start(f"actors-{i}", act, who, demand.rate) for i, who in enumerate(groups)]
         if demand.publications is not None:
             workers.append(start("learner", learn, (name,), demand.publications))
         for worker in workers:
@@ -121,14 +128,14 @@ def simulation(demand: Demand, target: Target, name: str) -> Iterator["Simulatio
 
 
 def learn(plan: Plan, connection: Connection) -> None:
-    """A simulated learner's process; none but it brings in torch."""
+    """Run a simulated learner, the only process that imports torch."""
     from mrcdrl.services.tools.simulate.learner import learn
 
     learn(plan, connection)
 
 
 class Simulation:
-    """Lets the processes work, watches them and replay, and sums up."""
+    """Lets the processes work, watches them and replay, and sums up the figures."""
 
     def __init__(
         self, demand: Demand, target: Target, workers: Sequence[Worker], session: Session
@@ -136,15 +143,15 @@ class Simulation:
         self._demand, self._target, self._workers = demand, target, workers
         self._stats = session.queue_subscriber(Keys(target.run).stats("replay", "*"))
         self._pids = target.pids | {worker.name: worker.pid for worker in workers}
-        self._replays: dict[str, dict[str, float]] = {}  # last words of each shard
-        self._held: list[float] = []
+        self._replays: dict[str, dict[str, float]] = {}  # last metrics of each shard
+        self._throttled: list[float] = []
         self._insert_s = latency(np.empty(0))
 
     def run(self, seconds: float, stop: StopSignal) -> dict[str, Any]:
-        """The figures of so many seconds, or of those until stopped."""
+        """Work for this long, or until stopped; return the figures."""
         for worker in self._workers:
             worker.say(BEGIN)
-        first, busy_s, began_s = self._usage(), busy_cores(), monotonic()
+        first, busy_s, began_s = self._readings(), busy_cores(), monotonic()
         shown_s = began_s
         while not stop.is_set() and monotonic() - began_s < seconds:
             self._listen()
@@ -152,7 +159,7 @@ class Simulation:
                 shown_s = monotonic()
                 self._show(shown_s - began_s)
         lasted_s = monotonic() - began_s
-        last, busy_end_s = self._usage(), busy_cores()
+        last, busy_end_s = self._readings(), busy_cores()
         for worker in self._workers:
             worker.say(STOP)
         for worker in self._workers:
@@ -161,24 +168,24 @@ class Simulation:
         if sys.stderr.isatty():
             sys.stderr.write("\n")
         busy = None if busy_s is None or busy_end_s is None else (busy_end_s - busy_s) / lasted_s
-        shares = {
-            name: Share.between(first[name], last[name], lasted_s) for name in first if name in last
+        usage = {
+            name: Usage.between(first[name], last[name], lasted_s) for name in first if name in last
         }
-        return self._figures(lasted_s, shares, busy)
+        return self._figures(lasted_s, usage, busy)
 
     def _count(self, name: str) -> int:
         return sum(worker.counts[name] for worker in self._workers)
 
     def _rate(self, name: str) -> float:
-        """Per second; a process that is late counts by its own clock."""
+        """Total per second, each process by its own clock."""
         return sum(worker.counts[name] / worker.seconds for worker in self._workers)
 
-    def _usage(self) -> dict[str, Usage]:
-        found = {name: Usage.of(pid) for name, pid in self._pids.items()}
-        return {name: usage for name, usage in found.items() if usage is not None}
+    def _readings(self) -> dict[str, Reading]:
+        found = {name: Reading.of(pid) for name, pid in self._pids.items()}
+        return {name: reading for name, reading in found.items() if reading is not None}
 
     def _listen(self) -> None:
-        """What replay says of itself, and the processes of themselves."""
+        """Read replay's statistics and the processes' tallies."""
         item = self._stats.take(_TICK_S)
         if item is not None:
             try:
@@ -186,7 +193,7 @@ class Simulation:
             except WireError:
                 return
             self._replays[stats.id] = stats.metrics
-            self._held.append(stats.metrics.get("insert_held", 0.0))
+            self._throttled.append(stats.metrics.get("insert_held", 0.0))
         for worker in self._workers:
             worker.drain()
 
@@ -198,33 +205,33 @@ class Simulation:
         line = (
             f"{now_s:.0f} s: {self._rate('transitions'):,.0f} transitions/s{of_due}, "
             f"insert p99 {'–' if p99 is None else f'{p99:.0f}'} ms, "
-            f"held {self._count('held')}, unanswered {self._count('unanswered')}, "
+            f"throttled {self._count('throttled')}, unanswered {self._count('unanswered')}, "
             f"weights {self._rate('weights_bytes') / 1e6:.0f} MB/s"
         )
         sys.stderr.write(f"\r\033[K{line}" if sys.stderr.isatty() else f"{line}\n")
         sys.stderr.flush()
 
     def _figures(
-        self, seconds: float, shares: dict[str, Share], busy: float | None
+        self, seconds: float, usage: dict[str, Usage], busy: float | None
     ) -> dict[str, Any]:
         actors, due = self._demand.actors, self._demand.actors * self._demand.rate
         inserts = latency(np.concatenate([a for w in self._workers for a in w.insert_s]))
-        held = fmean(self._held) if self._held else 0.0
-        cores, taken = available_cores(), self._rate("transitions")
-        load = Load(due, taken, held, inserts["p50"], cores, busy, shares)
+        throttled = fmean(self._throttled) if self._throttled else 0.0
+        cores, accepted = available_cores(), self._rate("transitions")
+        load = Load(due, accepted, throttled, inserts["p50"], cores, busy, usage)
         chunks = episode_chunks(self._target.config)
         expected = self._count("published") * actors
         replays = self._replays.values()
         return {
             "seconds": round(seconds, 2),
             "due_transitions_per_s": round(due) if math.isfinite(due) else None,
-            "transitions_per_s": round(taken, 1),
+            "transitions_per_s": round(accepted, 1),
             "chunks_per_s": round(self._rate("chunks"), 1),
             "inserts_per_s": round(self._rate("requests"), 1),
             "chunk_bytes": round(fmean(sum(map(len, encode_parts(c))) for c in chunks), 1),
             "insert_ms": inserts,
-            "held": self._count("held"),
-            "held_share": round(held, 3),
+            "held": self._count("throttled"),
+            "held_share": round(throttled, 3),
             "unanswered": self._count("unanswered"),
             "refused": sum(replay["refused"] for replay in replays),
             "wait_share": round(self._rate("waited_ms") / 1000 / actors, 3),
@@ -238,7 +245,7 @@ class Simulation:
                 "size": sum(replay["size"] for replay in replays),
                 "bytes": sum(replay["bytes"] for replay in replays),
             },
-            "processes": {name: asdict(share) for name, share in shares.items()},
+            "processes": {name: asdict(used) for name, used in usage.items()},
             "cores": cores,
             "busy_cores": None if busy is None else round(busy, 2),
             "first_limit": first_limit(load),

@@ -1,6 +1,7 @@
-"""The run that takes a simulated load: one of our own, or one that is up.
+"""The run that takes a simulated load: our own, or one that is up already.
 
-Invariants: what is started here has ended, and its folder is gone, when the block is left.
+Invariants: on leaving the block, the processes started here have ended and their directory is
+removed.
 """
 
 import os
@@ -15,11 +16,11 @@ from time import monotonic
 from mrcdrl.common.config import Config, TransportConfig, load_transport, to_toml
 from mrcdrl.common.errors import EndpointError, MrcdrlError
 from mrcdrl.common.runtime.files import RUN_CONFIG
-from mrcdrl.common.runtime.process import COMMAND, DIE_WITH_PARENT, StopSignal
+from mrcdrl.common.runtime.process import StopSignal, last_line, start_service
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session, free_endpoint
 
-NAME = "simulate"  # with which the names of runs begin whose data may be made up
+NAME = "simulate"  # prefix of the names of runs whose data may be made up
 _START_S = 120.0
 _END_S = 30.0
 
@@ -31,14 +32,14 @@ class Target:
     run: str
     config: Config
     transport: TransportConfig
-    pids: dict[str, int]  # of its processes, where they are ours
+    pids: dict[str, int]  # of its processes, if we started them
 
 
 @contextmanager
 def joined(
     run: str, endpoint: str, overrides: dict[str, str], stop: StopSignal
 ) -> Iterator[Target]:
-    """A run that is up; raises EndpointError or DeadlineError where it is not."""
+    """A run that is up; raises EndpointError or DeadlineError if it is not."""
     transport = load_transport(overrides).model_copy(update={"connect": (endpoint,), "listen": ()})
     with Session(transport) as session:
         joining = Joining(run, NAME, Path(), transport, overrides)
@@ -48,7 +49,7 @@ def joined(
 
 @contextmanager
 def own(config: Config, *, router: bool) -> Iterator[Target]:
-    """Replay, as many shards as configured; a router before it if asked for, or if it needs one."""
+    """Replay with the configured shards, behind a router if asked for or if there are several."""
     run, endpoint = f"{NAME}-{os.getpid()}", free_endpoint()
     transport = config.transport.model_copy(update={"connect": (endpoint,), "listen": ()})
     router = router or config.replay.shards > 1
@@ -73,20 +74,12 @@ def own(config: Config, *, router: bool) -> Iterator[Target]:
 
 
 class _Service:
-    """A service's process, ended with the block."""
+    """The process of a service, which ends with the block."""
 
     def __init__(self, role: str, flags: Sequence[str], log: Path) -> None:
         self._role, self._log = role, log
         environment = {k: v for k, v in os.environ.items() if not k.startswith("MRCDRL_")}
-        with log.open("wb") as output:
-            self.process = subprocess.Popen(
-                [*COMMAND, role, *flags],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                env={**environment, DIE_WITH_PARENT: str(os.getpid())},
-                start_new_session=True,
-            )
+        self.process = start_service(role, flags, log, environment)
 
     def __enter__(self) -> "_Service":
         return self
@@ -100,7 +93,7 @@ class _Service:
             self.process.wait()
 
     def await_endpoint(self, transport: TransportConfig) -> None:
-        """Wait for it to listen; raises MrcdrlError, with its last word, where it ends first."""
+        """Wait until it listens; raises MrcdrlError, with its last log line, if it ends first."""
         deadline = monotonic() + _START_S
         while True:
             try:
@@ -108,8 +101,6 @@ class _Service:
                 return
             except EndpointError:
                 if self.process.poll() is not None:
-                    said = self._log.read_text("utf-8", "replace").strip().splitlines()
-                    reason = said[-1] if said else "it said nothing"
-                    raise MrcdrlError(f"{self._role} failed: {reason}") from None
+                    raise MrcdrlError(f"{self._role} failed: {last_line(self._log)}") from None
                 if monotonic() > deadline:
                     raise

@@ -12,7 +12,14 @@ from mrcdrl.common.config import load_config
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.services.replay.table import Table
 from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
-from mrcdrl.services.tools.simulate.load import Load, Share, Usage, busy_cores, first_limit, latency
+from mrcdrl.services.tools.simulate.load import (
+    Load,
+    Reading,
+    Usage,
+    busy_cores,
+    first_limit,
+    latency,
+)
 from mrcdrl.services.tools.simulate.main import _allow_open_files, main
 
 
@@ -40,23 +47,23 @@ def test_chunks_are_those_of_whole_episodes(settings: dict[str, str], priorities
 # -- limits ------------------------------------------------------------------------------
 
 
-def share(cores: float) -> Share:
-    return Share(cores, 0.0, 100.0, 9)
+def using(cores: float) -> Usage:
+    return Usage(cores, 0.0, 100.0, 9)
 
 
-IDLE = {"replay-0": share(0.4), "actors-0": share(0.3)}
+IDLE = {"replay-0": using(0.4), "actors-0": using(0.3)}
 LIMITS = {
     "none": (Load(1000, 990, 0.0, 2.0, 4, 1.0, IDLE), "none"),
     "held": (Load(1000, 500, 0.5, 900.0, 4, 1.0, IDLE), "the rate limiter"),
     "machine": (
-        Load(math.inf, 500, 0.0, 9.0, 2, 1.99, {"replay-0": share(0.95)}),
+        Load(math.inf, 500, 0.0, 9.0, 2, 1.99, {"replay-0": using(0.95)}),
         "the machine's 2 cores: replay-0 0.95, all others 1.04",
     ),
     "replay": (
-        Load(math.inf, 500, 0.0, 9.0, 8, 3.0, {"actors-0": share(0.5), "replay-0": share(1.2)}),
+        Load(math.inf, 500, 0.0, 9.0, 8, 3.0, {"actors-0": using(0.5), "replay-0": using(1.2)}),
         "replay-0: it fills a core (1.20)",
     ),
-    "simulation": (Load(9, 1, 0.0, 9.0, 8, 3.0, {"actors-1": share(0.97)}), "the simulation"),
+    "simulation": (Load(9, 1, 0.0, 9.0, 8, 3.0, {"actors-1": using(0.97)}), "the simulation"),
     "way": (Load(math.inf, 500, 0.0, 9.0, 4, 1.0, IDLE), "an acknowledgement takes 9.0 ms"),
     "nothing": (Load(1000, 0, 0.0, None, 4, None, {}), "did not acknowledge"),
 }
@@ -68,17 +75,17 @@ def test_the_first_limit_is_named(load: Load, said: str) -> None:
 
 
 def test_what_a_process_used_is_read() -> None:
-    first, busy_s = Usage.of(os.getpid()), busy_cores()
+    first, busy_s = Reading.of(os.getpid()), busy_cores()
     assert first is not None
     assert busy_s is not None
-    while (last := Usage.of(os.getpid())) is not None and last.cpu_s <= first.cpu_s:
+    while (last := Reading.of(os.getpid())) is not None and last.cpu_s <= first.cpu_s:
         pass
     assert last is not None
-    used = Share.between(first, last, 0.5)
+    used = Usage.between(first, last, 0.5)
     assert used.cores > 0
     assert used.memory_mib > 1
     assert used.threads >= 1
-    assert Usage.of(2**22 + 1) is None  # above what Linux numbers
+    assert Reading.of(2**22 + 1) is None  # above what Linux numbers
 
 
 def test_latency_in_milliseconds() -> None:
@@ -99,7 +106,7 @@ REFUSED = {
     "a real run": (["--run", "four", "--connect", "tcp/127.0.0.1:1"], "'simulate', or --force"),
     "settings of a run": (
         ["--run", "simulate-1", "--connect", "tcp/127.0.0.1:1", "--replay.capacity", "9"],
-        "--replay.capacity is settled by the run",
+        "--replay.capacity is set by the run",
     ),
     "a misspelt flag": (["--actor", "3"], "did you mean --actors?"),
 }
@@ -116,7 +123,7 @@ def test_bad_input_is_refused(
     assert said in line
 
 
-def test_too_few_open_files_are_told_before_anything_starts(
+def test_too_few_open_files_are_reported_before_anything_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, 4096))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from mrcdrl.common.errors import DivergedError, MrcdrlError
+from mrcdrl.common.runtime import process
 from mrcdrl.services.train import fleet as fleet_module
 from mrcdrl.services.train.fleet import Fleet
 
@@ -36,7 +37,7 @@ def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("READY", str(tmp_path / "ready"))
     start = tmp_path / "start.py"
     start.write_text("import runpy, sys; runpy.run_path(sys.argv.pop(1) + '.py')")
-    monkeypatch.setattr(fleet_module, "COMMAND", (sys.executable, str(start)))
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, str(start)))
     return tmp_path
 
 
