@@ -8,24 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from mrcdrl.common.arena import ArenaBatch, make_codec
-from mrcdrl.common.messages.trajectory import Outcome
-from mrcdrl.common.sync.live_policy import LivePolicy
+from mrcdrl import ArenaParallelEnv, LivePolicy
 
 
 def main(run_dir: Path, episodes: int = 20) -> None:
     endpoint = (run_dir / "endpoint").read_text()
     with LivePolicy(run_dir.name, endpoint, epsilon=0.01) as policy:
-        arena = ArenaBatch(policy.config.arena, [np.random.default_rng()])
-        codec = make_codec(policy.config.arena)
+        env = ArenaParallelEnv(policy.config.arena)
         successes = 0
         for episode in range(1, episodes + 1):
-            policy.begin()
-            step = arena.reset(0)
-            while not step.last:
-                actions = policy.act(codec.decode(step.records))
-                step = arena.step(actions[np.newaxis])[0]
-            successes += step.outcome is Outcome.SUCCESS
+            observations, infos = env.reset()
+            while env.agents:
+                actions = policy.act(np.stack(list(observations.values())))
+                observations, _, _, _, infos = env.step(dict(zip(env.agents, actions, strict=True)))
+            successes += infos["robot_0"]["outcome"] == "success"
             print(f"{successes} of {episode}, version {policy.version}")
 
 

@@ -1,15 +1,15 @@
-"""Plays an episode of random actions through PettingZoo and writes it as the given GIF."""
+"""Play an episode of random actions through PettingZoo, and write it as the given GIF."""
 
 import sys
 
 import cv2
 
-from mrcdrl.common.arena.envs.parallel_env import parallel_env
-from mrcdrl.common.config import ArenaConfig
+from mrcdrl import ArenaConfig, ArenaParallelEnv
 
 
 def main(out: str, max_cycles: int = 150) -> None:
-    env = parallel_env(ArenaConfig(num_robots=3), max_cycles=max_cycles, render_mode="rgb_array")
+    config = ArenaConfig(num_robots=3)
+    env = ArenaParallelEnv(config, max_cycles=max_cycles, render_mode="rgb_array")
     env.reset(seed=7)
     images, score = [], 0.0
     while env.agents:

@@ -1,4 +1,4 @@
-"""Trains stable-baselines3's DQN on the arena, both unchanged: all robots share one policy.
+"""Train stable-baselines3's DQN on the arena, both unchanged: all robots share one policy.
 
 `python examples/sb3_dqn.py 2000000` takes hours, and 3 GB for its replay buffer.
 """
@@ -8,8 +8,7 @@ import sys
 from stable_baselines3 import DQN
 from stable_baselines3.common.vec_env import VecMonitor
 
-from mrcdrl.common.arena.envs.sb3 import ArenaVecEnv
-from mrcdrl.common.config import ArenaConfig
+from mrcdrl import ArenaConfig, ArenaVecEnv
 
 
 def main(robot_steps: int, buffer_size: int = 100_000, learning_starts: int = 20_000) -> DQN:

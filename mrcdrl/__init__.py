@@ -5,11 +5,19 @@
     config = mrcdrl.load_config("quick", {"arena.num_robots": "4"})
     env = mrcdrl.ArenaParallelEnv(config.arena)  # pip install 'mrcdrl[env]'
     policy = mrcdrl.load_policy("runs/four")  # pip install 'mrcdrl[learn]'
-    with mrcdrl.LivePolicy("four", "tcp/127.0.0.1:7447") as policy:
-        actions = policy.act(images)
 
-The names in `__all__` are the public API. Each is imported on first use, so `import mrcdrl` alone
-loads neither PyTorch nor numpy. A name whose extra is not installed raises ImportError.
+| names | what they are |
+|---|---|
+| `load_config`, `Config`, `ArenaConfig` | the configuration, from a preset or a file |
+| `load_policy`, `LivePolicy` | a policy with saved weights, or with a running run's newest |
+| `Arena` | the simulator of one arena |
+| `ArenaParallelEnv` | the arena for PettingZoo |
+| `ArenaVectorEnv`, `ArenaVecEnv` | the same for Gymnasium and for stable-baselines3 |
+| `CONTROLLERS`, `make_controller` | controllers that see the true state |
+| `MrcdrlError`, `ConfigError` | the base of all errors, and the error of a wrong setting |
+
+Each name is imported on first use, so `import mrcdrl` alone loads neither PyTorch nor numpy. A name
+whose extra is not installed raises ImportError.
 """
 
 import importlib
