@@ -83,9 +83,11 @@ def _render_views(  # type: ignore[no-untyped-def]
         c, s = 1.0, 0.0  # positions map to (c x - s y, s x + c y) about the robot
         if heading_up:
             c, s = -math.sin(scene[2]), -math.cos(scene[2])
-            _walls_slanted(view, lines, own_x, own_y, c, s, scale, wall)
         else:
             own_x, own_y = _on_grid(own_x, crop_half_px), _on_grid(own_y, crop_half_px)
+        if heading_up:  # only here are c and s float64, as numba types them
+            _walls_slanted(view, lines, own_x, own_y, c, s, scale, wall)
+        else:
             _walls_upright(view, own_x, own_y, scale, wall)
         _inner_walls(view, lines, own_x, own_y, c, s, scale, inner_walls)
         for j in range(obstacles, obstacles + 3 * num_obstacles, 3):
