@@ -37,7 +37,7 @@ from mrcdrl.common.sync.live_policy import LivePolicy
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from mrcdrl.services.evaluator.evaluator import WeightsTest
+from mrcdrl.services.evaluator.evaluator import WeightsEvaluator
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
 SMALL_RUN = (
@@ -154,7 +154,7 @@ def ordeal(
     finally:
         end_all(name)
     torch.set_num_threads(config.evaluator.threads)
-    test = WeightsTest(config, "evaluator")
+    evaluator = WeightsEvaluator(config, "evaluator")
     return {
         "kills": kills + kills // DURING_START,
         "seed": seed,
@@ -170,7 +170,7 @@ def ordeal(
         "evaluations": [
             (e.learner_step, e.weights_version, e.success_rate) for e in follower.evaluated
         ],
-        **scores([(test.evaluate(a, _on), test.evaluate(b, _on)) for a, b in resumed]),
+        **scores([(evaluator.evaluate(a, _on), evaluator.evaluate(b, _on)) for a, b in resumed]),
     }
 
 
@@ -218,7 +218,7 @@ class Follower:
         self.taken: list[Weights] = []
         self.published: list[Weights] = []
         self.evaluated: list[Evaluation] = []
-        self.told: dict[str, list[int]] = {"actor": [], "evaluator": [], "learner": []}
+        self.versions: dict[str, list[int]] = {"actor": [], "evaluator": [], "learner": []}
 
     @property
     def newest(self) -> Weights | None:
@@ -236,8 +236,8 @@ class Follower:
         self.evaluated += [decode(Evaluation, payload) for _, payload in self._evaluations.drain()]
         for _, payload in self._stats.drain():
             stats = decode(Stats, payload)
-            if stats.role in self.told:
-                self.told[stats.role].append(int(stats.metrics["weights_version"]))
+            if stats.role in self.versions:
+                self.versions[stats.role].append(int(stats.metrics["weights_version"]))
 
     def listen_for(self, seconds: float) -> None:
         until_s = time.monotonic() + seconds
@@ -269,7 +269,7 @@ class Follower:
         lines = backwards("published", [weights.order for weights in self.published])
         lines += backwards("taken", [weights.order for weights in self.taken])
         lines += backwards("evaluated", evaluated, again=True)
-        for role, versions in self.told.items():
+        for role, versions in self.versions.items():
             lines += backwards(role, [(0, version) for version in versions], again=True)
         if self._reader.refused:
             lines.append(f"{self._reader.refused} messages refused")

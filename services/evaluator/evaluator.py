@@ -39,7 +39,7 @@ class Evaluator:
         self._settings = config.evaluator
         self._stop = stop
         self._reader = WeightsReader(session, keys)
-        self._test = WeightsTest(config, worker)
+        self._evaluator = WeightsEvaluator(config, worker)
         self._best = BestWeights(joining.run_dir / BEST_WEIGHTS)
         self._publisher = session.publisher(keys.evaluation(worker))
         self._reporter = StatsReporter(
@@ -63,7 +63,7 @@ class Evaluator:
         """Evaluate one version, publish the result, keep the weights if they are the best."""
         self._version, self._busy = weights.version, True
         try:
-            result = self._test.evaluate(weights, self._keep_going)
+            result = self._evaluator.evaluate(weights, self._keep_going)
         except CheckpointError as error:
             _LOG.warning("weights %d refused: %s", weights.version, error)
             result = None
@@ -96,7 +96,7 @@ class Evaluator:
         )
 
 
-class WeightsTest:
+class WeightsEvaluator:
     """Evaluates weights by the paper's test, from the same starts each time."""
 
     def __init__(self, config: Config, worker: str) -> None:

@@ -68,13 +68,13 @@ def journey(
 
     hit_robot, hit_wall: what stopped each robot in the last frame, [K].
     """
-    places = path[..., :2]
+    positions = path[..., :2]
     own = targets[shortest_assignment(Scene(path[-1], targets))]
-    apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
+    apart = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=3)
     np.einsum("tkk->tk", apart)[:] = np.inf
     return Journey(
-        path_px=np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0),
-        straight_px=np.linalg.norm(own - places[0], axis=1),
+        path_px=np.linalg.norm(np.diff(positions, axis=0), axis=2).sum(axis=0),
+        straight_px=np.linalg.norm(own - positions[0], axis=1),
         separation_px=apart.min(axis=(0, 2)) - 2 * radius_px,
         hit_robot=hit_robot,
         hit_wall=hit_wall,
