@@ -44,16 +44,16 @@ def precision(setting: Precision, device: str | torch.device = "cpu") -> torch.d
 
 
 def resolve_device(setting: str, name: str) -> torch.device:
-    """`auto`: cuda if there is one, else cpu. name: of the setting.
+    """The device that a setting names; `auto`: cuda if there is one, else cpu.
 
-    Raises ConfigError for a device that is none.
+    name: the setting, for ConfigError where the device does not exist.
     """
     if setting == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(setting)
     except RuntimeError as error:
-        raise ConfigError(f"{name} {setting!r} is no device; use auto or cpu") from error
+        raise ConfigError(f"{name} {setting!r} is not a device; use auto or cpu") from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ConfigError(f"{name} {setting!r}: no CUDA device here; use auto or cpu")
     return device

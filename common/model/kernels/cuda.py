@@ -1,7 +1,7 @@
-"""Kernels of our own, compiled for the GPU at hand by NVIDIA's run-time compiler.
+"""CUDA kernels of this project, compiled for the GPU at hand by NVIDIA's run-time compiler.
 
-PyTorch's builds for CUDA bring that compiler and its binding (`cuda-bindings`) along; no toolkit
-and no C compiler need to be there. Where they are missing, KernelError says so.
+PyTorch's CUDA builds bring that compiler and its binding (`cuda-bindings`); neither a toolkit nor a
+C compiler is needed. KernelError says so where they are missing.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ Launch = Callable[[int, Sequence[Tensor | int]], None]
 
 
 class KernelError(Exception):
-    """A kernel that cannot be had on this device; the text says why."""
+    """A kernel that does not exist on this device; the text says why."""
 
 
 class Kernel:
@@ -49,7 +49,7 @@ class Kernel:
 
 
 def source_of(package: str, name: str) -> str:
-    """The text of a source file that lies beside a package's modules."""
+    """The text of a source file beside a package's modules."""
     return files(package).joinpath(name).read_text("utf-8")
 
 
@@ -67,11 +67,11 @@ def compile_kernel(
     definitions: macros. threads: of a block. shared_bytes: of memory that it shares, besides what
     the source declares with a size.
 
-    Raises KernelError where the device is no CUDA device or too small, the compiler is missing,
-    or it refuses.
+    Raises KernelError where the device is not a CUDA device or is too small, or the compiler is
+    missing or refuses the source.
     """
     if device.type != "cuda":
-        raise KernelError(f"{device} is no CUDA device")
+        raise KernelError(f"{device} is not a CUDA device")
     try:
         from cuda.bindings import driver
     except ImportError as error:
@@ -89,7 +89,7 @@ def compile_kernel(
 def machine_code(
     source: str, name: str, capability: tuple[int, int], definitions: Mapping[str, object]
 ) -> bytes:
-    """Compiled for devices of this compute capability, of which none needs to be here.
+    """The source compiled for devices of this compute capability; none needs to be present.
 
     Raises KernelError as `compile_kernel` does.
     """
@@ -120,7 +120,7 @@ def _read(size_of: Any, fill: Any, program: Any) -> bytes:
 
 
 def _check(result: tuple[Any, ...]) -> tuple[Any, ...]:
-    """What a call of the bindings gave besides its error."""
+    """The results of a call of the bindings; raises KernelError for its error."""
     error, *values = result
     if int(error) != 0:
         raise KernelError(f"CUDA refused: {error.name}")

@@ -1,10 +1,10 @@
 """The network's first layer on mostly black images: convolution, max-pool and ReLU in one.
 
-A black pixel adds nothing to a convolution, and of an arena's images 92 to 96 % are black: what
-is left is a twelfth of the products, or less. Images with more light in them go through torch's
-own operations (`common/model/q_network.py`), which are then faster.
+A black pixel adds nothing to a convolution, and 92 to 96 % of an arena's images are black: at most
+a twelfth of the products is left. For brighter images PyTorch's own operations are faster, and
+`fast_forward.py` uses them.
 
-Invariants: the values are those of torch's operations within float32's rounding; the same images
+Invariants: the values are those of PyTorch's operations within the rounding of float32; the same images
 and parameters give the same bits.
 
 Shapes: B = states, S = images of a state, V = their width, C = channels, P = width when pooled.
@@ -33,22 +33,25 @@ MAX_NONZERO: Final = 0.25  # of all pixels; with more, torch's operations are fa
 
 
 def pooled_px(view_px: int) -> int:
-    """Width of what the layer gives for images of this width, once it is pooled."""
+    """Width of the layer's pooled outputs for images of this width."""
     return ((view_px - KERNEL) // 2 + 1) // 2
 
 
 @dataclass(frozen=True, slots=True)
 class NonzeroPixels:
-    """The pixels of states that are not black, row after row."""
+    """The pixels of states that are not black, row by row."""
 
     shape: tuple[int, int, int]  # B, S, V
-    ends: NDArray[np.int32]  # [B S V + 1]: those of row i are ends[i] to ends[i + 1]
+    ends: NDArray[np.int32]  # [B S V + 1]: row i has the pixels ends[i] to ends[i + 1]
     columns: UInt8Array
     intensities: Float32Array
 
 
 def nonzero_pixels(observation: Tensor) -> NonzeroPixels | None:
-    """Those of states uint8 [B, S, V, V] on the CPU; None where they are more than MAX_NONZERO."""
+    """List the nonzero pixels of states uint8 [B, S, V, V] on the CPU.
+
+    None if more than MAX_NONZERO of all pixels are nonzero.
+    """
     images: UInt8Array = observation.numpy()
     num, stack, size, _ = images.shape
     if images.strides[3] != 1:
@@ -65,7 +68,7 @@ def nonzero_pixels(observation: Tensor) -> NonzeroPixels | None:
 def first_layer(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
     """max(0, max-pool(convolution)), float32 [B, C, P, P], channels last in memory.
 
-    weight: float32 [C, S, 5, 5], of intensities as they are; bias: float32 [C].
+    weight: float32 [C, S, 5, 5], for intensities of 0 to 255; bias: float32 [C].
     """
     if torch.is_grad_enabled() and weight.requires_grad:
         outputs: Tensor = _FirstLayer.apply(nonzero, weight, bias)  # type: ignore[no-untyped-call]
@@ -74,7 +77,7 @@ def first_layer(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 class _FirstLayer(torch.autograd.Function):
-    """With the gradients of weight and bias; images have none."""
+    """The layer with gradients of weight and bias; images have none."""
 
     @staticmethod
     def forward(ctx: Any, nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
@@ -101,22 +104,14 @@ _COLUMNS = np.argsort(TAPS).tolist()
 
 
 def _forward(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """The outputs, and which of the four each is the largest of, uint8; both [B, C, P, P]."""
+    """The outputs, and which of the four pooled values is the largest, uint8; both [B, C, P, P]."""
     num, stack, size = nonzero.shape
     side = pooled_px(size)
     pooled = torch.empty(num, side, side, CHANNELS)
     largest = torch.empty(num, side, side, CHANNELS, dtype=torch.uint8)
     taps = weight.detach().permute(1, 2, 3, 0)[:, :, list(TAPS)].contiguous()
-    inputs = (
-        nonzero.ends,
-        nonzero.columns,
-        nonzero.intensities,
-        stack,
-        size,
-        taps.numpy(),
-        bias.detach().numpy(),
-    )
-    layer(*inputs, pooled.numpy(), largest.numpy())
+    pixels = (nonzero.ends, nonzero.columns, nonzero.intensities, stack, size)
+    layer(*pixels, taps.numpy(), bias.detach().numpy(), pooled.numpy(), largest.numpy())
     return pooled.permute(0, 3, 1, 2), largest.permute(0, 3, 1, 2)
 
 

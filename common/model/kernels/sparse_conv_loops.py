@@ -1,11 +1,11 @@
-"""Loops of the first layer over pixels that are not black (`common/model/kernels/sparse_conv.py`).
+"""Loops of the first layer over nonzero pixels (`sparse_conv.py`).
 
-All that lies between pixels and pooled outputs stays in the processor's first cache: two lines of
-outputs at a time. The channels lie side by side, and everything is done to all of them at once;
-numba does not see by itself that it may, so those operations are written in LLVM's own terms.
+Everything between pixels and pooled outputs stays in the processor's first-level cache: two lines
+of outputs at a time. The channels lie side by side, and every operation works on all of them at
+once. Numba does not find these vector operations by itself, so they are written in LLVM's terms.
 
-Invariants: pure; of equal outputs the first counts as the largest, and one that is not a number
-counts as larger than any, both as in torch.
+Invariants: pure; the first of equal outputs counts as the largest, and NaN counts as larger than
+any number, both as in PyTorch.
 
 Shapes: B = states, S = images of a state, V = their width, C = channels, P = width when pooled.
 """
@@ -155,7 +155,7 @@ def _unpool(
 
 
 def _offsets(builder: Any, step: Any) -> list[Any]:
-    """Of the four outputs that are pooled: two side by side in each of two lines."""
+    """Offsets of the four outputs that are pooled: two side by side in each of two lines."""
     right = ir.Constant(step.type, CHANNELS)
     return [ir.Constant(step.type, 0), right, step, builder.add(step, right)]
 

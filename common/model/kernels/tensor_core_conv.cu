@@ -1,10 +1,10 @@
 // The network's first layer on a GPU's tensor cores: convolution, max-pool and ReLU in one, and its gradient.
 //
-// Images come as bytes and only what is pooled leaves, 1 of 9 bytes that torch's operations move. A block
-// takes images one after the other. Whoever compiles it defines STACK and VIEW (common/model/kernels/tensor_core_conv.py).
-// Greys and their gradients are multiplied in bfloat16 and added up in float32; a grey is exact in it.
+// Images come in as bytes and only pooled values leave: 1 of 9 bytes that PyTorch's operations move. A block
+// takes images one after the other. tensor_core_conv.py defines STACK and VIEW. Intensities and their
+// gradients are multiplied in bfloat16, where an intensity is exact, and added up in float32.
 //
-// Words are two bfloat16 numbers each. In shared memory a row of a image is WORDS of them. A window's 5 taps of
+// Words are two bfloat16 numbers each. In shared memory a row of an image is WORDS of them. A window's 5 taps of
 // a row are 3 words, the last with a 0 for weight; so that all of K, the taps of all rows and images, is read
 // by words, as the tensor cores take them: a lane is (g, q) = (lane / 4, lane % 4).
 
@@ -49,7 +49,7 @@ static __device__ Half half_of(float x) {
 
 static __device__ unsigned word_of(Half low, Half high) { return low | (unsigned)high << 16; }
 
-// The place in a image's words of a tap's word; of one that is none, some place.
+// The place in an image's words of a tap's word; of one that is none, some place.
 static __device__ int place_of_tap(int word) {
   if (word >= TAPS) return 0;
   return word / 15 * PLANE + word % 15 / 3 * WORDS + word % 3;

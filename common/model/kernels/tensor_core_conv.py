@@ -1,10 +1,10 @@
 """The network's first layer on a GPU's tensor cores: convolution, max-pool and ReLU in one.
 
-Torch's operations move all that a convolution gives through memory, four times as much as is left
-when it is pooled, and have no fast one for as few images as a state stacks. The kernels are in
-`tensor_core_conv.cu`; where they cannot be had, torch's operations do the same (`q_network.py`).
+PyTorch's operations move a convolution's whole output through memory, four times as much as pooling
+leaves of it, and are slow for as few channels as a state stacks images. The kernels are in
+`tensor_core_conv.cu`. Where they do not compile, `fast_forward.py` uses PyTorch's operations.
 
-Invariants: the values are those of torch's operations in bfloat16 within its rounding; the same
+Invariants: the values are those of PyTorch's operations in bfloat16 within its rounding; the same
 images and parameters give the same bits.
 
 Shapes: B = states, S = images of a state, V = their width, C = channels, P = width when pooled.
@@ -25,12 +25,12 @@ from mrcdrl.common.model.kernels.sparse_conv_loops import CHANNELS, KERNEL
 
 _LOG = logging.getLogger("network")
 _THREADS = 256
-_BLOCKS = 2  # that a multiprocessor has at once; with 1 or 3 it takes a fifth longer
+_BLOCKS = 2  # at once on a multiprocessor; 1 or 3 take a fifth longer
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the kernels see states; the macros and sizes that they are compiled for."""
+    """The form of states that the kernels are compiled for, and the sizes that follow from it."""
 
     stack: int
     view_px: int
@@ -50,12 +50,12 @@ class Layout:
 
     @property
     def image_bytes(self) -> int:
-        """Of memory that a block shares, for one state's images."""
+        """Shared memory of a block for one state's images."""
         return self.stack * self.view_px * ((self.view_px + 2) // 2) * 4
 
     @property
     def gradient_bytes(self) -> int:
-        """For the gradients of its pooled numbers."""
+        """Shared memory of a block for the gradients of a state's pooled values."""
         return CHANNELS * 3 * ((self.pooled_px**2 + 15) // 16 * 16 + 8)
 
 
@@ -66,11 +66,11 @@ class FirstLayer:
     layout: Layout
     forward: Launch
     backward: Launch
-    blocks: int  # at most
+    blocks: int  # at most, of one launch
 
     @classmethod
     def on(cls, device: torch.device, layout: Layout) -> Self:
-        """Raises KernelError where they cannot be had."""
+        """Compile the kernels; raises KernelError where that fails."""
         source, macros = first_layer_source(), layout.definitions
         shared = layout.image_bytes
         forward = compile_kernel(
@@ -86,7 +86,7 @@ class FirstLayer:
 
 @dataclass(frozen=True, slots=True)
 class Images:
-    """States as bytes, uint8 [B, S, V, V], rows without gaps, and what reads them."""
+    """States as bytes, uint8 [B, S, V, V], rows without gaps, and the kernels that read them."""
 
     intensities: Tensor
     layer: FirstLayer
@@ -98,7 +98,7 @@ def first_layer_source() -> str:
 
 
 def images_on_gpu(observation: Tensor) -> Images | None:
-    """States uint8 [B, S, V, V] on a GPU as the kernels take them; None where there are none."""
+    """States uint8 [B, S, V, V] on a GPU as the kernels take them; None if they do not compile."""
     _, stack, size, _ = observation.shape
     layer = _layer_on(observation.device, Layout(stack, size))
     return None if layer is None else images_for(layer, observation)
@@ -117,21 +117,21 @@ def _layer_on(device: torch.device, layout: Layout) -> FirstLayer | None:
     try:
         return FirstLayer.on(device, layout)
     except KernelError as error:
-        _LOG.warning("the first layer is computed by torch's operations: %s", error)
+        _LOG.warning("the first layer uses PyTorch's operations: %s", error)
         return None
 
 
 def first_layer(images: Images, weight: Tensor, bias: Tensor) -> Tensor:
     """max(0, max-pool(convolution)), bfloat16 [B, C, P, P], channels last in memory.
 
-    weight: float32 [C, S, 5, 5], of intensities as they are; bias: float32 [C].
+    weight: float32 [C, S, 5, 5], for intensities of 0 to 255; bias: float32 [C].
     """
     outputs: Tensor = _FirstLayer.apply(images, weight, bias)  # type: ignore[no-untyped-call]
     return outputs
 
 
 class _FirstLayer(torch.autograd.Function):
-    """With the gradients of weight and bias; images have none."""
+    """The layer with gradients of weight and bias; images have none."""
 
     @staticmethod
     def forward(ctx: Any, images: Images, weight: Tensor, bias: Tensor) -> Tensor:

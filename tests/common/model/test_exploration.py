@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mrcdrl.common.config import ExplorationConfig
 from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.errors import ConfigError
-from mrcdrl.common.model.exploration import epsilons, epsilon_exponents
+from mrcdrl.common.model.exploration import epsilon_exponents, epsilons
 
 PAPER = ((0, 1.0), (800_000, 0.1))
 

@@ -147,7 +147,7 @@ def test_where_the_kernels_cannot_be_had_torch_computes(caplog: pytest.LogCaptur
         assert images_on_gpu(states_of(LAYOUTS[0], 1)) is None
         assert images_on_gpu(states_of(LAYOUTS[0], 2)) is None
     said = [record.message for record in caplog.records]
-    assert said == ["the first layer is computed by torch's operations: cpu is no CUDA device"]
+    assert said == ["the first layer uses PyTorch's operations: cpu is not a CUDA device"]
 
 
 @pytest.mark.parametrize("layout", [*LAYOUTS, Layout(8, 84)])
