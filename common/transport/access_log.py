@@ -46,12 +46,11 @@ class AccessLogParser:
 
     def __init__(self) -> None:
         self._names: dict[str, str] = {}  # client's id to its certificate's common name
-        self._caching: dict[
-            str, tuple[str, str, int]
-        ] = {}  # thread to flow, key, decisions to come
+        # thread to flow, key and decisions to come
+        self._caching: dict[str, tuple[str, str, int]] = {}
 
     def parse(self, line: str) -> str | None:
-        """The message to log for a line of Zenoh's; None if there is none."""
+        """The message to log for a line of Zenoh's log, if any."""
         if _PASSED in line and _ALLOWED in line:
             return None  # nearly all lines: each message that passes writes two
         parts = _LINE.match(_COLOUR.sub("", line))

@@ -111,7 +111,8 @@ class Session(Closing):
             self._log_who_may_join()
         else:
             self._watch(self._session)
-            self._renewer = threading.Thread(target=self._renew, name="renew")
+            # daemon: a session that nobody closes must not keep the process alive
+            self._renewer = threading.Thread(target=self._renew, name="renew", daemon=True)
             self._renewer.start()
 
     def close(self) -> None:
