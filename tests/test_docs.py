@@ -299,6 +299,62 @@ def test_exported_arrays_are_documented() -> None:
         assert len([n for n in shape.strip("[]").split(", ") if n]) == array.ndim
 
 
+# -- where is …, and the glossary ---------------------------------------------------------
+
+
+def table(name: str) -> list[list[str]]:
+    """Cells of all rows of a page's tables but their headings."""
+    lines = [line for line in page(name).splitlines() if line.startswith("| ")]
+    cells = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines]
+    return [row for row in cells if row[0] not in ("word", "where is …")]
+
+
+def code(cell: str) -> list[str]:
+    """All that stands in backquotes."""
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def defined(path: Path) -> set[str]:
+    """Names that a module defines, and as CLASS.NAME those that its classes do."""
+    found: set[str] = set()
+    tree = ast.parse(path.read_text("utf-8"))
+    classes = [(f"{node.name}.", node.body) for node in tree.body if isinstance(node, ast.ClassDef)]
+    for prefix, body in [("", tree.body), *classes]:
+        for node in body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                found.add(prefix + node.name)
+            elif isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                found |= {prefix + ast.unparse(target) for target in targets}
+    return found
+
+
+@pytest.mark.parametrize("row", table("where-is.md"), ids=lambda row: row[0])
+def test_it_is_where_the_page_says(row: list[str]) -> None:
+    _, file, symbols = row
+    path = ROOT / code(file)[0]
+    assert code(symbols)
+    for symbol in code(symbols):
+        if path.suffix == ".py":
+            assert symbol in defined(path)
+        else:
+            assert symbol in path.read_text("utf-8")
+
+
+def test_the_glossary_is_in_order_and_its_files_exist() -> None:
+    entries = table("glossary.md")
+    words = [word.lower() for word, _, _ in entries]
+    assert words == sorted(set(words))
+    for word, _, file in entries:
+        assert (ROOT / code(file)[0]).is_file(), word
+
+
+def test_the_pages_to_start_from_are_linked() -> None:
+    for name in ("architecture.md", "glossary.md", "where-is.md"):
+        assert f"(docs/{name})" in README
+        assert name == "architecture.md" or f"({name})" in page("architecture.md")
+
+
 # -- commands ----------------------------------------------------------------------------
 
 
@@ -339,5 +395,7 @@ def test_links_and_files_exist(path: Path) -> None:
     text = path.read_text("utf-8")
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         assert target.startswith("https://") or (path.parent / target).exists(), target
-    for named in re.findall(r"`((?:common|services|configs|docs)/[\w/.]+)`", text):
+    for named in re.findall(
+        r"`((?:common|services|configs|mrcdrl|tests|examples|docs)/[\w/.-]+)`", text
+    ):
         assert (ROOT / named).exists(), named

@@ -5,6 +5,7 @@ the same floors.
 """
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
@@ -160,6 +161,18 @@ def test_no_module_imports_a_main_or_a_bare_name(path: Path) -> None:
     for name in imports_of(path):
         assert "__main__" not in name.split("."), f"{path} imports {name}"
         assert name.split(".")[0] not in ("common", "services", "configs"), f"{path}: {name}"
+
+
+def test_the_architecture_draws_the_floors() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    drawing = page.split("\n## Imports\n")[1].split("```")[1]
+    drawn: list[set[str]] = []
+    for line in drawing.strip("\n").splitlines():
+        if line[:2].strip():
+            assert int(line[:2]) == len(FLOORS) - 1 - len(drawn)
+            drawn.append(set())
+        drawn[-1] |= set(re.findall(r"(?:common|services)/[\w.]+|\bmrcdrl\b", line[:60]))
+    assert drawn[::-1] == [set(rooms) for rooms in FLOORS]
 
 
 def test_the_command_imports_no_service_until_it_is_called() -> None:
