@@ -1,11 +1,11 @@
 """The network's first layer on mostly black images: convolution, max-pool and ReLU in one.
 
 A black pixel adds nothing to a convolution, and 92 to 96 % of an arena's images are black: at most
-a twelfth of the products is left. For brighter images PyTorch's own operations are faster, and
-`fast_forward.py` uses them.
+a twelfth of the products is left. `fast_forward.py` gives brighter images to PyTorch's operations,
+which are faster on them.
 
-Invariants: the values are those of PyTorch's operations within the rounding of float32; the same images
-and parameters give the same bits.
+Invariants: the values are those of PyTorch's operations within the rounding of float32; the same
+images and parameters give the same bits.
 
 Shapes: B = states, S = images of a state, V = their width, C = channels, P = width when pooled.
 """

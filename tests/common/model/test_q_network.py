@@ -225,11 +225,11 @@ GOOD = weights_to_bytes(make_network(view_px=31))
 @pytest.mark.parametrize(
     ("payload", "message"),
     [
-        (b"", "unreadable"),
-        (b"\x00" * 7, "unreadable"),
-        (b"\xff" * 64, "unreadable"),
-        (struct.pack("<Q", 4) + b"[[1]" + b"x" * 9, "unreadable"),
-        (save({"a": torch.zeros(1)}), "unreadable"),
+        (b"", "not an MRCDRL weights file"),
+        (b"\x00" * 7, "not an MRCDRL weights file"),
+        (b"\xff" * 64, "not an MRCDRL weights file"),
+        (struct.pack("<Q", 4) + b"[[1]" + b"x" * 9, "not an MRCDRL weights file"),
+        (save({"a": torch.zeros(1)}), "not an MRCDRL weights file"),
         (GOOD[:-1], "unreadable"),
         (GOOD[: len(GOOD) // 2], "unreadable"),
         (GOOD + b"x", "unreadable"),

@@ -198,7 +198,7 @@ def test_where_the_kernel_cannot_be_had_the_host_renders_and_says_so(
 
 
 def test_a_kernel_of_a_device_that_is_no_gpu_is_refused() -> None:
-    with pytest.raises(KernelError, match="cpu is no CUDA device"):
+    with pytest.raises(KernelError, match="cpu is not a CUDA device"):
         compile_kernel("", "render", torch.device("cpu"), {}, threads=1)
 
 
