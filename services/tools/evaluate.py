@@ -14,25 +14,14 @@ from mrcdrl.common.messages.trajectory import Evaluation
 from mrcdrl.services.evaluator.navigation import Navigation, navigation, navigation_table
 from mrcdrl.services.evaluator.score import evaluation
 from mrcdrl.services.evaluator.trial import play
-from mrcdrl.services.tools.subject import Subject, subject, subject_parser
+from mrcdrl.services.tools.subject import Subject, parse_with_episodes, subject, subject_parser
 
 
 def main(argv: Sequence[str]) -> int:
     """Evaluate and print; return the exit code."""
     parser = subject_parser("evaluate", "The paper's test: one collision fails, epsilon 0.01.")
-    parser.add_argument(
-        "--episodes",
-        type=int,
-        default=1100,
-        help="number of starts; default: 1100, as in the paper",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the starts and the exploration"
-    )
     parser.add_argument("--json", action="store_true", help="print JSON")
-    arguments = parser.parse_args(argv)
-    if arguments.episodes < 1:
-        parser.error(f"--episodes {arguments.episodes}: at least 1")
+    arguments = parse_with_episodes(parser, argv, 1100)
     evaluated = subject(arguments)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:

@@ -17,7 +17,7 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
-from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import Path2D, check_suffix, trajectories
 from mrcdrl.services.plots.paper import (
     SUFFIXES,
@@ -99,7 +99,7 @@ def _views(arguments: argparse.Namespace) -> None:
     """Show what the lowermost robot sees (Fig. 3)."""
     shown = _one(arguments)
     config = shown.config.arena
-    (episode,) = _episodes(shown, 1, arguments.seed)
+    (episode,) = shown.episodes(1, arguments.seed)
     frame = min(arguments.frame, episode.frames)
     before = range(frame - config.stack + 1, frame + 1)
     targets, obstacles = episode.targets, episode.obstacles
@@ -118,7 +118,7 @@ def _views(arguments: argparse.Namespace) -> None:
 
 def _trajectories(arguments: argparse.Namespace) -> None:
     shown = _one(arguments)
-    episodes = _episodes(shown, arguments.episodes or 12, arguments.seed)
+    episodes = shown.episodes(arguments.episodes or 12, arguments.seed)
     trajectories(_paths(episodes), shown.config.arena, arguments.out)
 
 
@@ -134,7 +134,7 @@ def _comparison(arguments: argparse.Namespace) -> None:
                 raise ConfigError(f"different arenas: arena.{name} differs; set it by its flag")
     rows = []
     for name, shown in zip(_names(arguments), subjects, strict=True):
-        episodes = _episodes(shown, arguments.episodes or 4, arguments.seed)
+        episodes = shown.episodes(arguments.episodes or 4, arguments.seed)
         won = sum(episode.outcome is Outcome.SUCCESS for episode in episodes)
         rows.append(Contender(f"{name}: {won} of {len(episodes)}", _paths(episodes)))
     comparison(rows, world, arguments.out)
@@ -178,11 +178,6 @@ def _one(arguments: argparse.Namespace) -> Subject:
 
 def _names(arguments: argparse.Namespace) -> list[str]:
     return [*(path.resolve().stem for path in arguments.weights), *arguments.controller]
-
-
-def _episodes(shown: Subject, num: int, seed: int) -> list[EpisodeResult]:
-    starts = test_starts(shown.config.arena, num, seed)
-    return play(shown.config.arena, starts, shown.player(seed), keep_paths=True) or []
 
 
 def _paths(episodes: Sequence[EpisodeResult]) -> list[Path2D]:

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mrcdrl.common.arena import test_starts
 from mrcdrl.common.config.arguments import Parser
-from mrcdrl.common.errors import CheckpointError, RunDirectoryError
-from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
 from mrcdrl.services.plots.film import write_film
 from mrcdrl.services.tools.episode_frames import film_frames
@@ -34,10 +33,7 @@ def draw_episodes(run_dir: Path) -> None:
     """Plot and film episodes of the best weights; CheckpointError if the run has no weights."""
     shown = subject(subject_parser("report", "").parse_args([str(run_dir)]))
     arena = shown.config.arena
-    starts = test_starts(arena, _EPISODES, _SEED)
-    results = play(arena, starts, shown.player(_SEED), keep_paths=True)
-    if results is None:
-        raise CheckpointError(f"{run_dir}: no episode was played")
+    results = shown.episodes(_EPISODES, _SEED)
     paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]
     trajectories(paths, arena, run_dir / "trajectories.png")
     write_film(run_dir / "evaluation.mp4", film_frames(arena, shortest(results)), FPS)

@@ -1,13 +1,14 @@
 """The subject of a command: weights or a controller, and its arena, as named by flags."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from mrcdrl.common.arena import make_codec
+from mrcdrl.common.arena import make_codec, test_starts
 from mrcdrl.common.arena.controllers import CONTROLLERS, check_controller, make_controller
 from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
@@ -15,7 +16,13 @@ from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.saved_policy import config_beside, policy_of, read_saved, weights_path
-from mrcdrl.services.evaluator.trial import ControllerPlayer, Player, PolicyPlayer
+from mrcdrl.services.evaluator.trial import (
+    ControllerPlayer,
+    EpisodeResult,
+    Player,
+    PolicyPlayer,
+    play,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +43,11 @@ class Subject:
         name = self.controller or ""
         return ControllerPlayer(lambda: make_controller(name, arena, rng), epsilon, rng)
 
+    def episodes(self, num: int, seed: int) -> list[EpisodeResult]:
+        """Play the paper's test from `num` starts, keeping the robots' paths."""
+        starts = test_starts(self.config.arena, num, seed)
+        return play(self.config.arena, starts, self.player(seed), keep_paths=True) or []
+
 
 def subject_parser(command: str, description: str) -> Parser:
     """Make a parser with the flags that name a subject."""
@@ -46,6 +58,16 @@ def subject_parser(command: str, description: str) -> Parser:
     parser.add_argument("--controller", help=f"instead of weights: {', '.join(CONTROLLERS)}")
     add_arena_flags(parser)
     return parser
+
+
+def parse_with_episodes(parser: Parser, argv: Sequence[str], num: int) -> argparse.Namespace:
+    """Add --episodes, by default `num`, and --seed; parse the flags."""
+    parser.add_argument("--episodes", type=int, default=num, help=f"starts; default: {num}")
+    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
+    arguments = parser.parse_args(argv)
+    if arguments.episodes < 1:
+        parser.error(f"--episodes {arguments.episodes}: at least 1")
+    return arguments
 
 
 def add_arena_flags(parser: Parser) -> None:

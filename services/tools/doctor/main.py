@@ -41,14 +41,9 @@ def main(argv: Sequence[str]) -> int:
 
 def parser() -> Parser:
     """Make the command's parser."""
-    made = Parser(
-        prog="mrcdrl doctor",
-        description="Check this machine, and a run, and say how to fix what is wrong.",
-    )
+    made = Parser(prog="mrcdrl doctor", description="Check this machine and a run.")
     made.add_argument("--run", help="also check this run, which is up")
-    made.add_argument(
-        "--connect", action="append", help="the run's endpoint, such as tcp/HOST:7447"
-    )
+    made.add_argument("--connect", action="append", help="its endpoint, such as tcp/HOST:7447")
     made.add_argument("--run-dir", type=Path, default=Path("runs"), help="directory of the runs")
     made.add_argument("--config", help="a preset or a TOML file; default: the run's")
     made.add_argument("--json", action="store_true", help="print the findings as JSON")

@@ -20,7 +20,7 @@ _NANO = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Totals:
     """Resources that a process has used since it started."""
 
     cpu_s: float
@@ -29,7 +29,7 @@ class Reading:
     threads: int
 
     @classmethod
-    def of(cls, pid: int) -> "Reading | None":
+    def of(cls, pid: int) -> "Totals | None":
         """Read /proc; None if the process has ended or the system does not provide it."""
         folder = Path(f"/proc/{pid}")
         try:
@@ -59,7 +59,7 @@ class Usage:
     threads: int
 
     @classmethod
-    def between(cls, first: Reading, last: Reading, seconds: float) -> "Usage":
+    def between(cls, first: Totals, last: Totals, seconds: float) -> "Usage":
         return cls(
             round((last.cpu_s - first.cpu_s) / seconds, 3),
             round((last.waited_s - first.waited_s) / seconds, 3),
@@ -109,7 +109,7 @@ class Load:
     usage: dict[str, Usage]  # by process; actors-0 and so on simulate
 
 
-def first_limit(load: Load) -> str:
+def bottleneck(load: Load) -> str:
     """Name the bottleneck."""
     if math.isfinite(load.due) and load.accepted >= _ACCEPTED * load.due:
         return "none: all transitions due were accepted"

@@ -66,12 +66,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         help="robot steps per second of each actor, or max: as many as are acknowledged; "
         f"default: {ROBOT_STEPS_PER_S:g}, those of an actor with a dedicated core",
     )
-    parser.add_argument(
-        "--processes", type=_count, help="processes that hold the actors; default: one per core"
-    )
-    parser.add_argument(
-        "--publications", type=_frequency, help="of weights, per second; default: 1"
-    )
+    parser.add_argument("--processes", type=_count, help="of the actors; default: one per core")
+    parser.add_argument("--publications", type=_frequency, help="of weights a second; default: 1")
     parser.add_argument("--router", action="store_true", help="put a router in front of replay")
     parser.add_argument("--config", help=f"a preset or a TOML file; default: {DEFAULT_PRESET}")
     parser.add_argument("--run", help=f"join this run instead; its name begins with {NAME}")

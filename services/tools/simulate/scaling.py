@@ -17,7 +17,6 @@ import numpy as np
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.metrics import ActorMetrics, kinds
 from mrcdrl.common.messages.trajectory import (
-    Chunk,
     EpisodeSummary,
     InsertReply,
     Outcome,
@@ -203,10 +202,6 @@ def weights_bytes(config: Config) -> int:
     return _size(Weights.of(2**60, 10**5, 10**6, payload))
 
 
-def _payload_s(flow: Flow) -> float:
-    return flow.bytes_per_s * PAYLOAD_S
-
-
 @cache
 def _chunk(config: Config) -> tuple[float, float]:
     """Mean bytes and transitions of a chunk."""
@@ -214,20 +209,7 @@ def _chunk(config: Config) -> tuple[float, float]:
     return fmean(map(_size, chunks)), fmean(map(len, chunks))
 
 
-Message = (
-    Chunk
-    | EpisodeSummary
-    | InsertReply
-    | Priorities
-    | PrioritiesReply
-    | SampleRequest
-    | Samples
-    | Stats
-    | Weights
-)
-
-
-def _size(message: Message) -> int:
+def _size(message: object) -> int:
     return sum(map(len, encode_parts(message)))
 
 

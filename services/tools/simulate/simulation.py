@@ -26,14 +26,7 @@ from mrcdrl.common.runtime.process import StopSignal, available_cores
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.simulate.actors import BEGIN, STOP, Plan, Tally, act, episode_chunks
-from mrcdrl.services.tools.simulate.load import (
-    Load,
-    Reading,
-    Usage,
-    busy_cores,
-    first_limit,
-    latency,
-)
+from mrcdrl.services.tools.simulate.load import Load, Totals, Usage, bottleneck, busy_cores, latency
 from mrcdrl.services.tools.simulate.target import Target
 
 _JOIN_S = 120.0
@@ -151,7 +144,7 @@ class Simulation:
         """Work for this long, or until stopped; return the figures."""
         for worker in self._workers:
             worker.say(BEGIN)
-        first, busy_s, began_s = self._readings(), busy_cores(), monotonic()
+        first, busy_s, began_s = self._totals(), busy_cores(), monotonic()
         shown_s = began_s
         while not stop.is_set() and monotonic() - began_s < seconds:
             self._listen()
@@ -159,7 +152,7 @@ class Simulation:
                 shown_s = monotonic()
                 self._show(shown_s - began_s)
         lasted_s = monotonic() - began_s
-        last, busy_end_s = self._readings(), busy_cores()
+        last, busy_end_s = self._totals(), busy_cores()
         for worker in self._workers:
             worker.say(STOP)
         for worker in self._workers:
@@ -180,9 +173,9 @@ class Simulation:
         """Total per second, each process by its own clock."""
         return sum(worker.counts[name] / worker.seconds for worker in self._workers)
 
-    def _readings(self) -> dict[str, Reading]:
-        found = {name: Reading.of(pid) for name, pid in self._pids.items()}
-        return {name: reading for name, reading in found.items() if reading is not None}
+    def _totals(self) -> dict[str, Totals]:
+        found = {name: Totals.of(pid) for name, pid in self._pids.items()}
+        return {name: totals for name, totals in found.items() if totals is not None}
 
     def _listen(self) -> None:
         """Read replay's statistics and the processes' tallies."""
@@ -248,5 +241,5 @@ class Simulation:
             "processes": {name: asdict(used) for name, used in usage.items()},
             "cores": cores,
             "busy_cores": None if busy is None else round(busy, 2),
-            "first_limit": first_limit(load),
+            "first_limit": bottleneck(load),
         }

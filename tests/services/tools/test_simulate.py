@@ -12,14 +12,7 @@ from mrcdrl.common.config import load_config
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.services.replay.table import Table
 from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
-from mrcdrl.services.tools.simulate.load import (
-    Load,
-    Reading,
-    Usage,
-    busy_cores,
-    first_limit,
-    latency,
-)
+from mrcdrl.services.tools.simulate.load import Load, Totals, Usage, bottleneck, busy_cores, latency
 from mrcdrl.services.tools.simulate.main import _allow_open_files, main
 
 
@@ -70,22 +63,22 @@ LIMITS = {
 
 
 @pytest.mark.parametrize(("load", "said"), LIMITS.values(), ids=LIMITS)
-def test_the_first_limit_is_named(load: Load, said: str) -> None:
-    assert said in first_limit(load)
+def test_the_bottleneck_is_named(load: Load, said: str) -> None:
+    assert said in bottleneck(load)
 
 
 def test_what_a_process_used_is_read() -> None:
-    first, busy_s = Reading.of(os.getpid()), busy_cores()
+    first, busy_s = Totals.of(os.getpid()), busy_cores()
     assert first is not None
     assert busy_s is not None
-    while (last := Reading.of(os.getpid())) is not None and last.cpu_s <= first.cpu_s:
+    while (last := Totals.of(os.getpid())) is not None and last.cpu_s <= first.cpu_s:
         pass
     assert last is not None
     used = Usage.between(first, last, 0.5)
     assert used.cores > 0
     assert used.memory_mib > 1
     assert used.threads >= 1
-    assert Reading.of(2**22 + 1) is None  # above what Linux numbers
+    assert Totals.of(2**22 + 1) is None  # above what Linux numbers
 
 
 def test_latency_in_milliseconds() -> None:
