@@ -1,8 +1,8 @@
 """A Docker engine for the tests, and the stack on it.
 
-Invariants: an engine that was there is left as it was, one brought up here is taken down; all the
-stack makes bears its project's name, save the images, and is removed at the end; every wait has a
-deadline and says what it waited for.
+Invariants: an engine that was running is left as it was, and one started here is stopped; all that
+the stack creates, except its images, has its project's name and is removed at the end; every wait
+has a deadline and says what it waited for.
 """
 
 import json
@@ -22,16 +22,16 @@ BASE = REPOSITORY / "docker-compose.yml"
 SMOKE = Path(__file__).with_name("smoke.yml")
 ENGINE_VARIABLE = "MRCDRL_DOCKER_ENGINE"  # a script that brings an engine up and down
 WHEELS_VARIABLE = "PIP_FIND_LINKS"
-LEARNING = ("actor", "learner", "evaluator")  # whose images hold PyTorch
+LEARNING = ("actor", "learner", "evaluator")  # their images hold PyTorch
 T = TypeVar("T")
 
 
 class NoEngineError(Exception):
-    """There is no engine, nor can one be had; says why."""
+    """No engine is running and none can be started; the message says why."""
 
 
 def works(environment: Mapping[str, str]) -> bool:
-    """Whether there is an engine, with Compose."""
+    """Whether an engine is running, with Compose."""
     try:
         for command in (["docker", "compose", "version"], ["docker", "info"]):
             subprocess.run(
@@ -85,7 +85,7 @@ class Container:
 
 
 class Stack:
-    """`docker compose …` with these overrides, under a project name of its own."""
+    """`docker compose …` with these overrides, under its own project name."""
 
     def __init__(self, environment: Mapping[str, str], *overrides: Path) -> None:
         self.project = f"mrcdrl-test-{uuid.uuid4().hex[:8]}"
@@ -94,14 +94,14 @@ class Stack:
         self._head += [word for file in (BASE, *overrides) for word in ("--file", str(file))]
 
     def compose(self, *arguments: str, timeout_s: float = 120.0) -> str:
-        """Its output; fails with all it said."""
+        """Output of the command; a failure shows all of it."""
         return self._run([*self._head, *arguments], timeout_s)
 
     def docker(self, *arguments: str) -> str:
         return self._run(["docker", *arguments], 60.0)
 
     def containers(self, service: str) -> list[Container]:
-        """Those of a service, stopped ones too, in the order they were made."""
+        """Containers of a service, stopped ones included, sorted by id."""
         ids = self.compose("ps", "--all", "--quiet", service).split()
         return sorted(map(self.container, ids), key=lambda c: c.id) if ids else []
 
@@ -117,7 +117,7 @@ class Stack:
         )
 
     def signal(self, container: Container, name: str) -> None:
-        """To the service's process, not to the container: `docker kill` would count as a stop."""
+        """Signal the service's process, not the container: `docker kill` would count as a stop."""
         command = f"kill -{name} $(cut -d' ' -f1 /tmp/heartbeat)"
         self.docker("exec", container.id, "sh", "-c", command)
 
@@ -125,13 +125,13 @@ class Stack:
         return self.compose("logs", "--no-color", service)
 
     def config(self) -> dict[str, Any]:
-        """The services as Compose reads the files; needs no engine."""
+        """The services as Compose reads the files; no engine is needed."""
         said = json.loads(self.compose("config", "--format", "json"))
         services: dict[str, Any] = said["services"]
         return services
 
     def status(self) -> dict[str, Any]:
-        """What `mrcdrl status --json` says now."""
+        """Output of `mrcdrl status --json`."""
         said = self.compose(
             *("exec", "--no-TTY", "status", "mrcdrl", "status", "--run", "stack", "--json")
         )
@@ -139,7 +139,7 @@ class Stack:
         return told
 
     def eventually(self, look: Callable[[], T | None], what: str, timeout_s: float) -> T:
-        """What `look` returns as soon as that is true; fails with the logs after the time."""
+        """The first true result of `look`; fails with the logs after timeout_s."""
         deadline, pause = time.monotonic() + timeout_s, threading.Event()
         while not (found := look()):
             if time.monotonic() > deadline:
@@ -152,7 +152,7 @@ class Stack:
         self.compose("down", "--volumes", "--timeout", "5", timeout_s=180)
 
     def left(self) -> list[str]:
-        """Containers, volumes and networks that bear the project's name."""
+        """Containers, volumes and networks with the project's name."""
         label = f"label=com.docker.compose.project={self.project}"
         return [
             line
@@ -175,7 +175,7 @@ class Stack:
 
 
 def wheels_override(environment: Mapping[str, str], folder: Path) -> Path:
-    """A compose file by which the images get wheels from where pip gets them on this machine."""
+    """Write a compose file that gives the builds the local wheels that pip uses on this machine."""
     links = [Path(word) for word in environment.get(WHEELS_VARIABLE, "").split()]
     folders = [str(link) for link in links if link.is_dir()]
     build = {"build": {"additional_contexts": {"wheels": folders[0]}}} if folders else {}

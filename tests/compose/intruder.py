@@ -1,7 +1,7 @@
-"""Attempts at a secured stack, from a container beside it that has what the image `certs` has.
+"""Attacks on a secured stack, from a container beside it with the image `certs`.
 
-Invariant: the text of this file, run with an attempt's name, ends with 0 only where the attempt
-came to nothing while who may do the same, if anybody, could.
+Invariant: the text of this file, run with the name of an attempt, exits with 0 only if the attempt
+failed while a service that is allowed to do the same, if there is one, succeeded.
 """
 
 import shutil

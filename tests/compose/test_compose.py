@@ -1,7 +1,7 @@
 """`docker compose up` on a real engine: healthy, training, scaled, through faults, stopped.
 
-Two stacks, one after the other, each for all its tests in their order: the plain one, and one that
-is secured and has two shards. Without an engine they are skipped, and say so.
+There are two stacks, one after the other, and the tests of each run in order: a plain one, and a
+secured one with two shards. Without an engine the tests are skipped, and say so.
 """
 
 import json
@@ -24,13 +24,25 @@ from tests.compose.compose_stack import (
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 SERVICES = ("router", "replay", "learner", "actor", "evaluator", "status")
-UP_S = 180.0  # 60 on a machine that does nothing else
-AGAIN_S = 120.0  # from a fault to the next
+UP_S = 180.0  # 60 on an idle machine
+AGAIN_S = 120.0  # from a fault to recovery
 SECURE, SHARDS, GPU, ZENOHD = (
     REPOSITORY / f"compose.{name}.yml" for name in ("secure", "shards", "gpu", "zenohd")
 )
 SECURED = Path(__file__).with_name("secured.yml")
 INTRUDER = Path(__file__).with_name("intruder.py")
+# A working directory that holds packages named like ours, and a module of the standard library.
+CROWDED = """set -e
+mkdir /tmp/crowded && cd /tmp/crowded
+mkdir common services configs
+for file in common/__init__.py services/__init__.py configs/__init__.py mrcdrl.py random.py; do
+  echo "raise SystemExit(13)" > $file
+done
+mrcdrl --help
+python -m mrcdrl "$0" --help
+python -m mrcdrl.common.runtime.heartbeat --help
+python -c "import random, mrcdrl.services.$0.main"
+"""
 REFUSED = {  # what the router's log says of each of the intruder's attempts
     "without_a_certificate": "refused a connection: peer sent no certificates",
     "with_a_foreign_authority": "refused a connection: invalid peer certificate",
@@ -42,7 +54,7 @@ REFUSED = {  # what the router's log says of each of the intruder's attempts
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """In which there is an engine; brought up for these tests, if one can be had."""
+    """An environment with a Docker engine, started for these tests where none is running."""
     with ExitStack() as cleanup:
         try:
             found = cleanup.enter_context(engine(tmp_path_factory.mktemp("engine")))
@@ -76,13 +88,13 @@ def secured(built: dict[str, str]) -> Iterator[Stack]:
 
 
 def records(stack: Stack, name: str) -> list[dict[str, Any]]:
-    """Lines of a file that the status service keeps."""
+    """Complete lines of a file that the status service writes."""
     text = stack.compose("exec", "--no-TTY", "status", "cat", f"/runs/stack/{name}.jsonl")
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
 
 
 def come_up(stack: Stack, services: tuple[str, ...]) -> None:
-    """One healthy container of each, as soon as Compose says so."""
+    """Start the stack, and wait for one healthy container of each service."""
     stack.compose("up", "--detach", "--wait", "--no-build", timeout_s=UP_S)
     for service in services:
         assert len(stack.containers(service)) == 1
@@ -101,6 +113,14 @@ def restarted(stack: Stack, before: Container) -> bool:
 @pytest.mark.timeout(3000)  # an engine and images may have to be made first
 def test_it_comes_up_healthy(stack: Stack) -> None:
     come_up(stack, SERVICES)
+
+
+@pytest.mark.parametrize("service", ["replay", "actor"])
+def test_it_imports_nothing_from_the_working_directory(stack: Stack, service: str) -> None:
+    stack.compose(
+        *("run", "--rm", "--no-deps", "--no-TTY", "--entrypoint", "sh", service),
+        *("-c", CROWDED, service),
+    )
 
 
 @pytest.mark.parametrize("service", SERVICES)
@@ -213,7 +233,7 @@ def test_it_learns_on_and_leaves_nothing(secured: Stack) -> None:
 
 
 def test_the_learner_reserves_a_gpu(environment: dict[str, str]) -> None:
-    """Not more than that: there is none to run it on."""
+    """Check the configuration only: there is no GPU to run it on."""
     plain, changed = Stack(environment).config(), Stack(environment, GPU).config()
     device = {"driver": "nvidia", "count": 1, "capabilities": ["gpu"]}
     learner = changed.pop("learner")
@@ -223,7 +243,7 @@ def test_the_learner_reserves_a_gpu(environment: dict[str, str]) -> None:
 
 
 def test_zenohd_is_the_router_by_the_same_file(environment: dict[str, str]) -> None:
-    """Not more than that: its image is not run."""
+    """Check the configuration only: its image is not run."""
     plain, changed = Stack(environment).config(), Stack(environment, ZENOHD).config()
     router = changed.pop("router")
     (version,) = (

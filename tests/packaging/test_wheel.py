@@ -156,8 +156,9 @@ def test_it_trains_from_any_directory(bin_dir: Path, tmp_path: Path, crowded: bo
             (tmp_path / name).mkdir()
             (tmp_path / name / "__init__.py").write_text(BROKEN)
         (tmp_path / "random.py").write_text(BROKEN)
-    train = ("train", "--config", "smoke", "--name", "first", "--learner-steps", "20", *SMALL)
+    brief = ("--learner-steps", "10", "--evaluator.period_s=5", *SMALL)
+    train = ("train", "--config", "smoke", "--name", "first", *brief)
     run(bin_dir / "mrcdrl", *train, cwd=tmp_path)
     summary = json.loads((tmp_path / "runs" / "first" / "summary.json").read_bytes())
-    assert summary["learner_steps"] == 20
+    assert summary["learner_steps"] == 10
     assert summary["versions"]["mrcdrl"] == VERSION
