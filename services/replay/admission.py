@@ -4,7 +4,6 @@ Invariant: pure; the service calls it under its lock.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -18,35 +17,21 @@ from mrcdrl.services.replay.table import Table
 _TOO_FEW_INSERTS = "the actors have not inserted enough for another sample yet"
 
 
-class SampleAdmission(Protocol):
-    """Decides when a sample request is met."""
-
-    def can_sample(self, request: SampleRequest) -> bool:
-        """Whether the request can be met now; raises WireError where it never can."""
-        ...
-
-    def reseed(self, request: SampleRequest) -> None:
-        """Prepare the random stream for the request's samples."""
-        ...
-
-    def why_not(self, request: SampleRequest) -> str:
-        """Why the request cannot be met yet."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class RateLimited:
-    """Samples as fast as the rate limiter allows, from one random stream."""
+    """Admits samples as fast as the rate limiter allows, from one random stream."""
 
     limiter: RateLimiter
 
     def can_sample(self, request: SampleRequest) -> bool:
+        """Whether the request can be met now."""
         return self.limiter.can_sample(request.batch_size)
 
     def reseed(self, request: SampleRequest) -> None:
-        pass
+        """Leave the random stream as it is."""
 
     def why_not(self, request: SampleRequest) -> str:
+        """Why the request cannot be met yet."""
         inserts, min_size = self.limiter.inserts, self.limiter.min_size
         if inserts < min_size:
             return f"the table holds {inserts} of the first {min_size} transitions"
@@ -55,7 +40,7 @@ class RateLimited:
 
 @dataclass(frozen=True, slots=True)
 class InLockstep:
-    """Samples from exactly the transitions due at a learner step, seeded by that step.
+    """Admits samples from exactly the transitions due at a learner step, seeded by that step.
 
     A learner that asks for the same step again is given the same samples.
     """
@@ -65,6 +50,7 @@ class InLockstep:
     seed: int
 
     def can_sample(self, request: SampleRequest) -> bool:
+        """Whether the request can be met now; raises WireError if it never can."""
         step, inserts = request.learner_step, self.table.next_key
         if step < 0:
             raise WireError("in lockstep a sample request must state its learner step")
@@ -83,9 +69,10 @@ class InLockstep:
         return _TOO_FEW_INSERTS
 
 
+SampleAdmission = RateLimited | InLockstep
+
+
 def make_admission(config: Config, table: Table, limiter: RateLimiter) -> SampleAdmission:
     """The admission a configuration asks for."""
     lockstep = Lockstep.from_config(config)
-    if lockstep is None:
-        return RateLimited(limiter)
-    return InLockstep(lockstep, table, config.replay.seed)
+    return InLockstep(lockstep, table, config.replay.seed) if lockstep else RateLimited(limiter)
