@@ -1,22 +1,22 @@
-# An image a service: `docker build --target replay .`; `docker compose build` makes them all.
+# An image for each service: `docker build --target replay .`; `docker compose build` makes all.
 # Replay, router and status work without PyTorch, and their images are small.
 ARG PYTHON=python:3.11-slim-bookworm
 
-# Wheels that pip prefers, such as another build of PyTorch: `--build-context wheels=FOLDER`.
+# Wheels for pip to prefer, such as another build of PyTorch: `--build-context wheels=FOLDER`.
 FROM scratch AS wheels
 COPY LICENSE /
 
-# -- what is installed: the exact versions of constraints.txt, the package last ----------------------
+# -- packages: the exact versions of constraints.txt, our own package last ---------------------------
 
 FROM ${PYTHON} AS installer
-# Or a further index to look for such a build.
+# An additional index, as another source of such a build.
 ARG PIP_EXTRA_INDEX_URL
 ENV PIP_CONSTRAINT=/src/constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 WORKDIR /src
 RUN python -m venv --without-pip /opt/mrcdrl
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 
-# Without tests, highlighting of other languages, and byte code that no service reads.
+# Leaves out tests, highlighting of other languages, and byte code that no service reads.
 FROM installer AS small-installed
 RUN pip --python /opt/mrcdrl/bin/python install --no-compile . \
  && cd /opt/mrcdrl/lib/python3*/site-packages \
@@ -45,10 +45,10 @@ COPY configs configs
 COPY mrcdrl mrcdrl
 RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
 
-# -- what all have: no root, one folder to keep runs in, health by the work that is done -------------
+# -- common to all: an unprivileged user, a folder for runs, health by work done ---------------------
 
 FROM ${PYTHON} AS service
-# Set by whoever builds for others; `mrcdrl.__version__` says what is installed.
+# Labels only; `mrcdrl.__version__` is the installed version.
 ARG VERSION=unknown
 ARG REVISION=unknown
 LABEL org.opencontainers.image.title="mrcdrl" \
@@ -65,7 +65,7 @@ ENV PATH=/opt/mrcdrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTEC
 WORKDIR /
 USER mrcdrl
 ENTRYPOINT ["mrcdrl"]
-# Not working for 30 s is unhealthy; a main loop that hangs for 120 s is killed, and started again.
+# Unhealthy after 30 s without work; a main loop that hangs for 120 s is killed and restarted.
 HEALTHCHECK --interval=5s --timeout=5s --start-period=120s --retries=2 \
     CMD ["python", "-m", "mrcdrl.common.runtime.heartbeat", "--max-age", "30", "--kill-after", "120"]
 
@@ -74,12 +74,12 @@ COPY --from=small-installed /opt/mrcdrl /opt/mrcdrl
 
 FROM service AS learning
 COPY --from=learning-installed /opt/mrcdrl /opt/mrcdrl
-# Compiled functions are kept here. Freed memory stays with the process, as with `mrcdrl train`.
+# Compiled functions are cached here. Freed memory stays with the process, as with `mrcdrl train`.
 ENV NUMBA_CACHE_DIR=/var/cache/mrcdrl \
     MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=4294967296 MALLOC_TOP_PAD_=67108864
 RUN python -m mrcdrl.services.tools.precompile
 
-# -- one target a service -----------------------------------------------------------------------------
+# -- one target for each service ----------------------------------------------------------------------
 
 FROM small AS router
 CMD ["router", "--help"]

@@ -19,7 +19,7 @@ CLOCK_SHIFT = "CHAOS_CLOCK_SHIFT_S"
 
 @contextmanager
 def stopped(pid: int) -> Iterator[None]:
-    """SIGSTOP, then SIGCONT: there, and silent."""
+    """SIGSTOP, then SIGCONT: up, but silent."""
     os.kill(pid, signal.SIGSTOP)
     try:
         yield
@@ -29,7 +29,7 @@ def stopped(pid: int) -> Iterator[None]:
 
 @contextmanager
 def cut_off(host: Host) -> Iterator[None]:
-    """All of a host's cables out: packets are lost, connections are not told."""
+    """Cut all links of a host: packets are lost, connections are not told."""
     host.plug("down")
     try:
         yield
@@ -39,7 +39,7 @@ def cut_off(host: Host) -> Iterator[None]:
 
 @contextmanager
 def lossy(host: Host, share: float) -> Iterator[None]:
-    """This share of a host's packets is lost, of those that come and of those that go."""
+    """Lose this fraction of a host's packets, in each direction."""
     rule = ("-m", "statistic", "--mode", "random", "--probability", str(share), "-j", "DROP")
     for way in ("INPUT", "OUTPUT"):
         host.run("iptables", "--append", way, *rule)
@@ -52,7 +52,7 @@ def lossy(host: Host, share: float) -> Iterator[None]:
 
 @contextmanager
 def slow(host: Host, kilobits_per_s: int) -> Iterator[None]:
-    """A host's links carry no more than this, each way."""
+    """Limit what a host's links carry, in each direction."""
     ends = [(host.namespace, port) for port in host.ports]
     ends += [(network.namespace, host.name) for network in host.networks]
     for namespace, port in ends:
@@ -66,7 +66,7 @@ def slow(host: Host, kilobits_per_s: int) -> Iterator[None]:
 
 
 def why_no_hosts() -> str | None:
-    """What is missing for hosts and the faults of their networks, in words; None: nothing."""
+    """Say what is missing for hosts and the faults of their networks; None if nothing."""
     if os.geteuid() != 0:
         return "they take root"
     try:
@@ -80,7 +80,7 @@ def why_no_hosts() -> str | None:
 
 @contextmanager
 def disk(folder: Path, num_bytes: int) -> Iterator[None]:
-    """A file system of so many bytes on a folder, for `full` to fill."""
+    """Mount a file system of a given size in bytes on a folder, for `full` to fill."""
     mounted = [line.split()[:2] for line in Path("/proc/mounts").read_text("utf-8").splitlines()]
     left = owners_are_gone(source for source, _ in mounted)
     for place in (place for source, place in mounted if source in left):
@@ -95,7 +95,7 @@ def disk(folder: Path, num_bytes: int) -> Iterator[None]:
 
 @contextmanager
 def full(folder: Path) -> Iterator[None]:
-    """No room on a `disk`: it becomes as small as what it holds."""
+    """Leave no room on a `disk`: shrink it to what it holds."""
     before = os.statvfs(folder)
     _shrink(folder)
     try:
@@ -105,7 +105,7 @@ def full(folder: Path) -> Iterator[None]:
 
 
 def _shrink(folder: Path, attempts: int = 20) -> None:
-    """Where somebody writes meanwhile, it may already hold more than it is to hold."""
+    """Shrink it; if a process writes meanwhile, it may already hold more than the new size."""
     now = os.statvfs(folder)
     used = max(now.f_blocks - now.f_bfree, 1) * now.f_frsize
     try:
@@ -117,6 +117,6 @@ def _shrink(folder: Path, attempts: int = 20) -> None:
 
 
 def shifted_clock(seconds: float) -> dict[str, str]:
-    """Variables of a process whose wall clock is to be so far ahead."""
+    """Environment of a process whose wall clock is ahead by this much."""
     path = os.pathsep.join(filter(None, (str(_CLOCK), os.environ.get("PYTHONPATH"))))
     return {"PYTHONPATH": path, CLOCK_SHIFT: str(seconds)}

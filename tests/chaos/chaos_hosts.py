@@ -1,4 +1,4 @@
-"""Hosts of our own on this machine: network namespaces, joined by networks that touch nothing else.
+"""Hosts on this machine: network namespaces, joined by networks that touch nothing else.
 
 A network is a bridge in a namespace, a host a namespace with a cable to each of its networks.
 Packets are not forwarded between networks: what crosses them is relayed by routers of a run.
@@ -21,7 +21,7 @@ TCP_RETRIES = 3  # as docs/compose.md asks of several hosts
 
 
 def run(*command: str) -> str:
-    """Its output; raises OSError with all that the command said."""
+    """Output of the command; raises OSError with its messages if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     if done.returncode:
         raise OSError(f"{' '.join(command)}: {done.stderr.strip() or done.stdout.strip()}")
@@ -29,19 +29,19 @@ def run(*command: str) -> str:
 
 
 def owned_name(name: str) -> str:
-    """A name that tells whose it is."""
+    """A name that says which process it belongs to."""
     return f"mrcdrl-{os.getpid()}-{name}"
 
 
 def owners_are_gone(names: Iterator[str]) -> list[str]:
-    """Those of our names whose processes were killed before they could remove what bears them."""
+    """Names left by processes that were killed before they could clean up."""
     owners = {name: re.fullmatch(r"mrcdrl-(\d+)-.*", name) for name in names}
     return [n for n, owner in owners.items() if owner and not Path("/proc", owner[1]).exists()]
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """One switch; `number` tells its addresses from other networks'."""
+    """One switch; `number` distinguishes its addresses from those of other networks."""
 
     name: str
     namespace: str
@@ -59,7 +59,7 @@ class Host:
 
     @property
     def prefix(self) -> tuple[str, ...]:
-        """Of a command that is to run there; the process it starts becomes that command's."""
+        """Prefix of a command that runs there, in the very process that the prefix starts."""
         return ("ip", "netns", "exec", self.namespace)
 
     @property
@@ -70,17 +70,17 @@ class Host:
         run(*self.prefix, *command)
 
     def address(self, network: Network) -> str:
-        """Its IPv4 address in a network that it is in."""
+        """IPv4 address in one of its networks."""
         return f"10.77.{network.number}.{network.hosts.index(self) + 1}"
 
     def plug(self, state: str) -> None:
-        """Cables "up" or "down", at the switch: the host itself sees that its carrier is gone."""
+        """Set the links "up" or "down" at the switch; the host sees that it has no carrier."""
         for network in self.networks:
             run("ip", "-n", network.namespace, "link", "set", "dev", self.name, state)
 
 
 class Hosts:
-    """Makes networks and hosts for as long as the block of `hosts` lasts."""
+    """Makes networks and hosts that exist until the block of `hosts` ends."""
 
     def __init__(self, owned: ExitStack) -> None:
         self._owned = owned
@@ -94,7 +94,7 @@ class Hosts:
         return Network(name, namespace, self._num_networks)
 
     def host(self, name: str, *networks: Network) -> Host:
-        """name: at most 15 characters, which is what Linux has for an interface."""
+        """name: at most 15 characters, Linux's limit for an interface."""
         host = Host(name, self._namespace(name), networks)
         host.run("sh", "-c", f"echo {TCP_RETRIES} > /proc/sys/net/ipv4/tcp_retries2")
         run("ip", "-n", host.namespace, "link", "set", "dev", "lo", "up")
@@ -117,7 +117,7 @@ class Hosts:
 
 @contextmanager
 def hosts() -> Iterator[Hosts]:
-    """Raises OSError where this machine does not let us have any."""
+    """Yield a maker of networks and hosts; raises OSError if this machine allows none."""
     listed = run("ip", "netns", "list").splitlines()
     for namespace in owners_are_gone(line.split()[0] for line in listed):
         run("ip", "netns", "delete", namespace)

@@ -1,4 +1,4 @@
-"""Who watches a run through faults, and holds what docs/architecture.md promises against it.
+"""An observer that watches a run through faults and checks the promises of docs/architecture.md.
 
 Invariants: it only listens; a service works again when, after a fault's end, it was heard of over
 the network twice and has done more by its own figures, and its heartbeat says so too.
@@ -37,7 +37,7 @@ class Life:
 
 @dataclass
 class Observer:
-    """Follows weights and figures, and has started again what ended, while it listens."""
+    """Follows weights and metrics, and restarts ended services while it listens."""
 
     stack: Stack
     session: Session
@@ -51,13 +51,13 @@ class Observer:
         self._weights = self.session.queue_subscriber(keys.weights)
 
     def listen(self, seconds: float) -> None:
-        """Take in what comes in that time."""
+        """Process what arrives within this time."""
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
             self.hear()
 
     def recovery(self, moment_s: float, limit_s: float) -> dict[str, float]:
-        """Seconds from a moment until each service worked again; the limit where it did not."""
+        """Seconds from a moment until each service worked again; the limit if it did not."""
         first: dict[Life, float] = {}
         recovered: dict[str, float] = {}
         names = set(self.stack.services)
@@ -74,7 +74,7 @@ class Observer:
         return {name: recovered.get(name, limit_s) for name in self.stack.services}
 
     def hear(self) -> Stats | None:
-        """The next figures of a service; None where none came in a moment."""
+        """The next metrics of a service; None if none arrive soon."""
         self.stack.tend()
         item = self._stats.take(_LISTEN_S)
         for _, payload in self._weights.drain():
@@ -92,7 +92,7 @@ class Observer:
         return stats
 
     def figure(self, service: str, name: str) -> float:
-        """As it was last told by any process of that service."""
+        """The last value that any process of that service reported."""
         told = [metrics for life, metrics in self.told.items() if life.service == service]
         return told[-1][name] if told else -1.0
 
@@ -102,7 +102,7 @@ def _life(stats: Stats) -> Life:
 
 
 def judge(observer: Observer, config: Config, run: Path) -> dict[str, Any]:
-    """The log of an ended run against what was acknowledged while it was up; empty lists: well.
+    """Compare an ended run's log with what was acknowledged; empty lists mean that all is well.
 
     lost: transitions that an actor was told were kept and the log has not, and numbers that are
     missing between two chunks of one actor's process: each is sent when the one before it was
@@ -146,7 +146,7 @@ def compare(contents: Contents, told: dict[Life, dict[str, float]]) -> dict[str,
 
 
 def _stream(life: Life, stored: dict[Life, list[int]]) -> Life:
-    """What names a process's chunks: drawn from its clock just after what names its figures."""
+    """Identity of a process's chunks, taken from its clock just after that of its metrics."""
     after = [
         s.incarnation
         for s in stored

@@ -1,4 +1,4 @@
-"""A run on hosts of its own: two networks, a router in each, and the two linked.
+"""A run on hosts in two networks, with a router in each, and the routers linked.
 
     left: replay, learner, router-left      right: actors, evaluator, router-right
 
@@ -31,7 +31,7 @@ ON_DISKS = ("replay", "learner")  # whose folders can be filled
 
 @dataclass
 class Service:
-    """A service on its host, one process after the other."""
+    """A service on its host: one process after another."""
 
     name: str
     host: Host
@@ -70,7 +70,7 @@ class Service:
 
     @contextmanager
     def killed(self, variables: Mapping[str, str] | None = None) -> Iterator[None]:
-        """kill -9, and no other process until the block ends."""
+        """Kill with SIGKILL, and start no other process until the block ends."""
         self.away = True
         self.process.signal(signal.SIGKILL)
         self.process.wait()
@@ -81,14 +81,14 @@ class Service:
             self.away = False
 
     def worked_since(self, moment_s: float) -> bool:
-        """What a container's health is judged by: done something since then."""
+        """Whether it did work since then, as a container's health check asks."""
         with suppress(OSError, ValueError):
             return Pulse.read(self.folder / "heartbeat").worked_s > moment_s
         return False
 
     @property
     def log(self) -> str:
-        """What all its processes said."""
+        """Output of all its processes."""
         files = sorted(self.folder.glob("*.err"), key=lambda path: path.stat().st_mtime)
         return "".join(path.read_text("utf-8", "replace") for path in files)
 
@@ -106,7 +106,7 @@ class Stack:
             service.tend()
 
     def end(self) -> dict[str, int]:
-        """Ask all to end, those first that still have something to hand in; the exit codes."""
+        """Ask all to end, first those that still have something to send; return the exit codes."""
         joined = [s for s in self.services.values() if s.role not in ("replay", "router")]
         for service in self.services.values():
             service.away = True
@@ -118,7 +118,7 @@ class Stack:
         return {name: self.services[name].process.end() for name in reversed(self.services)}
 
     def logs(self) -> str:
-        """The end of what each service said."""
+        """The end of each service's output."""
         return "\n".join(
             f"--- {name}, ended by itself: {service.ends}\n{service.log[-2000:]}"
             for name, service in self.services.items()
@@ -127,7 +127,7 @@ class Stack:
 
 @contextmanager
 def stack(config: Config, folder: Path, num_actors: int) -> Iterator[Stack]:
-    """All services started; ended, and their hosts gone, when the block is left.
+    """Start all services; end them and remove their hosts when the block is left.
 
     Raises OSError where this machine does not let us have hosts.
     """

@@ -1,4 +1,4 @@
-"""A run on hosts of its own trains through faults, and keeps what architecture.md promises.
+"""A run on separate hosts trains through faults, and keeps the promises of architecture.md.
 
 Two networks with a router each, the routers linked: replay and learner in one, actors and evaluator
 in the other. `python -m benchmarks.chaos` does the same for as long as one likes.
@@ -25,7 +25,7 @@ def _hosts() -> None:
 
 
 def one_of_each_kind(services: list[str], seed: int) -> list[Fault]:
-    """Short ones, on services that the seed chooses."""
+    """Short faults, on services that the seed chooses."""
     rng = random.Random(seed)
     faults = [Fault(kind, rng.choice(services), 1.5, rng.random()) for kind in KINDS]
     faults += [Fault("full", "replay", 1.5, 0.0), Fault("clock", "learner", 0.0, 0.0)]

@@ -53,7 +53,7 @@ def _hosts() -> None:
 
 @contextmanager
 def two_hosts() -> Iterator[tuple[Host, Host, str]]:
-    """One that serves, one that asks, and the first's address."""
+    """A server, a client, and the server's address."""
     with hosts() as made:
         network = made.network("network")
         serving, asking = made.host("serving", network), made.host("asking", network)
@@ -66,7 +66,7 @@ def two_hosts() -> Iterator[tuple[Host, Host, str]]:
 
 
 def reaches(host: Host, address: str, patience_s: float = 1.0) -> bool:
-    """Whether all bytes come, none of them later than `patience_s` after the one before."""
+    """Whether all bytes arrive, each at most `patience_s` after the one before."""
     command = [*host.prefix, sys.executable, "-c", CLIENT, address, str(patience_s)]
     return subprocess.run(command, capture_output=True, timeout=60, check=False).returncode == 0
 
@@ -148,7 +148,7 @@ TAMPERED: dict[str, tuple[list[int], int, dict[str, object]]] = {
 
 @pytest.mark.parametrize("name", TAMPERED)
 def test_the_observer_would_notice(name: str) -> None:
-    """What a log holds of four chunks that were acknowledged, and what is said of it."""
+    """What a log holds of four acknowledged chunks, and the expected verdict."""
     numbers, doubled, said = TAMPERED[name]
     config = load_config("smoke", {"actor.chunk_length": str(LENGTH)}, environ={})
     contents = Contents(chunks=[counting_chunk(config, "actor-0", 8, n) for n in numbers])
@@ -160,7 +160,7 @@ def test_the_observer_would_notice(name: str) -> None:
 
 @dataclass
 class Said:
-    """What is published, instead of a subscriber."""
+    """Published messages, in place of a subscriber."""
 
     waiting: list[bytes]
 
@@ -172,7 +172,7 @@ class Said:
 
 
 def heard(figures: list[Stats], weights: list[Weights]) -> Observer:
-    """An observer that has listened to these."""
+    """An observer that has listened to these messages."""
     session = MagicMock()
     session.queue_subscriber.side_effect = [Said([*map(encode, s)]) for s in (figures, weights)]
     observer = Observer(MagicMock(run="run"), session)
@@ -215,5 +215,5 @@ def test_the_observer_would_notice_older_weights(
 def test_the_observer_would_notice_who_goes_back_to_older_weights(
     lives: list[tuple[int, int]], backwards: int
 ) -> None:
-    """(version, which process of the actor) as it is told."""
+    """The reported (version, process of the actor)."""
     assert len(heard([acting_by(*life) for life in lives], []).backwards) == backwards

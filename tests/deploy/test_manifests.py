@@ -1,7 +1,8 @@
 """The Kubernetes manifests fit Kubernetes' schema, the Dockerfile, Compose and our commands.
 
-Without a cluster: each object against the schema that the API server publishes, strictly, for an
-older and the newest version; then what no schema says: names that one object takes from another.
+No cluster is needed. Each object is checked strictly against the schema that the API server
+publishes, for an older and the newest version; then names that one object takes from another, which
+no schema checks.
 """
 
 import re
@@ -47,7 +48,7 @@ def container(name: str) -> Object:
 
 
 def selected(labels: dict[str, str]) -> set[str]:
-    """Workloads whose pods bear all of them."""
+    """Workloads whose pods have all of these labels."""
     return {n for n, pod in PODS.items() if labels.items() <= pod["metadata"]["labels"].items()}
 
 

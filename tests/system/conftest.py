@@ -1,4 +1,4 @@
-"""What the system tests share: one small finished run."""
+"""A small finished run, shared by the system tests."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from tests.system.system_processes import (
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """`mrcdrl train --config smoke`, no terminal."""
+    """A run of `mrcdrl train --config smoke` without a terminal."""
     folder = tmp_path_factory.mktemp("finished")
     name, mapped = run_name("smoke"), set[Path]()
 

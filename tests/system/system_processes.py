@@ -1,7 +1,7 @@
 """Real processes for the system tests: started, watched, and ended whatever the test does.
 
-Invariants: every process gets a session of its own and is ended by its id; output goes to files,
-so that no pipe fills; every wait has a deadline and says what it waited for.
+Invariants: every process has its own session and is ended by its id; output goes to files, so that
+no pipe fills; every wait has a deadline and says what it waited for.
 """
 
 import os
@@ -19,7 +19,7 @@ from typing import TypeVar
 from mrcdrl.common.runtime.process import COMMAND
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PATIENCE_S = 300.0  # a machine under load takes so long for what takes five seconds on an idle one
+PATIENCE_S = 300.0  # enough on a loaded machine for what takes five seconds on an idle one
 T = TypeVar("T")
 
 # Every part at its smallest: images of 32 px, short episodes.
@@ -33,12 +33,12 @@ SMALL = (
 
 
 def run_name(stem: str) -> str:
-    """A name that no other process on this machine bears in its command line."""
+    """A name that no other process on this machine has in its command line."""
     return f"{stem}-{uuid.uuid4().hex[:12]}"
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This process's environment without settings of mrcdrl's, and more."""
+    """This process's environment without settings of mrcdrl, plus more."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MRCDRL_")}
     return {**kept, **more}
 
@@ -103,7 +103,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A run of `mrcdrl train` that ended by itself, and what was there after it."""
+    """A run of `mrcdrl train` that ended by itself, and what it left."""
 
     name: str
     path: Path
@@ -120,7 +120,7 @@ def eventually(
     timeout_s: float = PATIENCE_S,
     pause_s: float = 0.05,
 ) -> T:
-    """What `look` returns as soon as that is true; fails after the time."""
+    """The first true result of `look`; fails after timeout_s."""
     pause = threading.Event()
     deadline = time.monotonic() + timeout_s
     while not (found := look()):
@@ -131,7 +131,7 @@ def eventually(
 
 
 def processes_of(*words: str) -> dict[int, str]:
-    """Process id to command line of those that have all words in theirs, this one left out."""
+    """Process id to command line of all other processes with these words in theirs."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit() or int(entry.name) == os.getpid():
@@ -146,13 +146,13 @@ def processes_of(*words: str) -> dict[int, str]:
 
 
 def end_all(name: str) -> None:
-    """Kill what a failed test left of a run."""
+    """Kill the processes that a failed test left of a run."""
     for pid in processes_of(name):
         os.kill(pid, signal.SIGKILL)
 
 
 def shared_memory_of(name: str) -> set[Path]:
-    """Files below /dev/shm that a run's processes have mapped now."""
+    """Files below /dev/shm that a run's processes have mapped."""
     found = set()
     for pid in processes_of(name):
         try:
@@ -164,7 +164,7 @@ def shared_memory_of(name: str) -> set[Path]:
 
 
 def error_line(stderr: str) -> str:
-    """The one line that says what is wrong; log lines with a time before it may stand above."""
+    """The line that says what is wrong; log lines, with a time, may precede it."""
     assert "Traceback" not in stderr, stderr
     lines = [line for line in stderr.splitlines() if not re.match(r"\d{4}-\d\d-\d\d ", line)]
     assert len(lines) == 1, stderr

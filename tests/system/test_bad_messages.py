@@ -1,4 +1,4 @@
-"""A real replay service refuses what is no message, counts it, and goes on.
+"""A real replay service refuses malformed messages, counts them, and continues.
 
 The messages are those of benchmarks/bad_messages.py, which sends as many as one likes.
 """

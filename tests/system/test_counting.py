@@ -183,7 +183,7 @@ def first_weights() -> Weights:
 
 
 def streams_of(seen: dict[int, Transition]) -> dict[tuple[int, int], Stream]:
-    """Of each robot, what the table holds in the order of insertion."""
+    """Transitions of each robot in the table, in the order of insertion."""
     streams: dict[tuple[int, int], Stream] = {}
     for key in sorted(seen):
         identity, robot, episode, step = seen[key]

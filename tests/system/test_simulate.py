@@ -1,4 +1,4 @@
-"""`mrcdrl simulate` as a process: on replay of its own, and on a run that is up."""
+"""`mrcdrl simulate` as a process: with its own replay, and on a run that is up."""
 
 import json
 import signal
