@@ -119,8 +119,8 @@ class QNetwork(nn.Module):
         x = functional.conv2d(x, (weight / WHITE).to(dtype), bias.to(dtype), stride=2)
         x = functional.relu(functional.max_pool2d(x, 2))
         for layer in (self.conv2, self.conv3):
-            weight, bias = (p.to(dtype) for p in layer.parameters())
-            x = functional.relu(functional.conv2d(x, weight, bias, layer.stride))
+            kernel, offset = (p.to(dtype) for p in layer.parameters())
+            x = functional.relu(functional.conv2d(x, kernel, offset, layer.stride))
         features = x.flatten(1)
         if self.kind != "duel":
             return self._stream(features, self.hidden, self.action_value)

@@ -1,4 +1,4 @@
-"""From sampled records to the tensors of one learner step.
+"""The tensors of one learner step, made from sampled records.
 
 Invariants: every record is rendered once; a transition's images and its action undergo the same
 symmetry; states are stacked out of single images here only.

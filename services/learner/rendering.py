@@ -1,4 +1,4 @@
-"""From records to the images that a learner step reads, rendered on the host or on its device.
+"""Images that a learner step reads, rendered from records on the host or on its device.
 
 Invariants: both give the same images within one level of intensity; a row's images undergo the
 symmetry drawn for it. common.arena.images.views defines what a GPU renders: `rendering.cu` repeats

@@ -1,4 +1,4 @@
-"""From the gradients of a batch's slices to new parameters, shared by the learner's threads.
+"""New parameters from the gradients of a batch's slices, shared by the learner's threads.
 
 Nearly all parameters are weights of fully connected layers, and what a step does to them is bound
 by memory. So no slice of a batch computes their gradient: it is one product over the whole batch,
