@@ -23,5 +23,5 @@ def versions() -> dict[str, str]:
 
 
 def all_versions() -> dict[str, str | None]:
-    """As `versions`, with None for each package that is not installed."""
+    """Versions by name, with None for each package that is not installed."""
     return dict.fromkeys(VERSIONED) | versions()

@@ -1,4 +1,4 @@
-"""Which of the table's transitions make up a mini-batch: all alike, or those with large errors.
+"""Choice of a mini-batch's transitions: all alike, or those with large errors more often.
 
 Invariants: a transition outside the table is never sampled; the probabilities are those by which
 the samples were drawn. Keys are consecutive; the table says which ones it holds.

@@ -59,7 +59,7 @@ class ShardStream:
         self.late = False
         """The last wait for it was in vain."""
         self.total_priority: float | None = None
-        """As of its last answer."""
+        """Value in its last answer; None before the first."""
         self.table_size = 0
 
     def ready(self, timeout_s: float = 0.0) -> bool:
