@@ -58,7 +58,7 @@ def _actors_row(
     name = Text(f"{len(up)} {more}actors", style=ROLE_STYLES["actor"])
     rate = sum(actor.per_second("robot_steps", now) for actor in up)
     versions, seconds = state.max_staleness
-    weights = f"weights: ≤ {versions} versions behind, ≤ {seconds:.0f} s old"
+    weights = f"weights: ≤ {versions} behind, ≤ {seconds:.0f} s old"
     lost = len(actors) - len(up)
     presence = Text(f"{lost} lost", style="bold red") if lost else Text("up", "green")
     return name, f"{thousands(rate)} robot steps/s · {weights}", presence
@@ -111,13 +111,12 @@ def figures(state: RunState, service: Service, now: float) -> str:
 
 
 def _age(state: RunState, actor: Service) -> str:
-    """How old an actor's weights are; empty before that is known."""
+    """Versions that an actor's weights are behind, and their age; empty before they are known."""
     staleness = state.staleness(actor)
     if staleness is None:
         return ""
     behind, seconds = staleness
-    versions = f"{behind} version{'s' * (behind > 1)} behind" if behind else "current"
-    return f" · weights: {versions}, {seconds:.0f} s old"
+    return f" · weights: {f'{behind} behind' if behind else 'current'}, {seconds:.0f} s old"
 
 
 def _percent(**shares: float) -> str:
