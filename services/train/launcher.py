@@ -161,7 +161,7 @@ def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
 def expectation(config: Config) -> str:
     """The cores and actors of this machine, and the pace to expect."""
     cores, actors = available_cores(), num_actors(config)
-    pace = "" if cores >= _ENOUGH_CORES else f", slower than on the {_ENOUGH_CORES} of the docs"
+    pace = "" if cores >= _ENOUGH_CORES else f", slower than the {_ENOUGH_CORES} cores in the docs"
     return f"{cores} cores, {actors} actor{'s' if actors > 1 else ''}{pace}"
 
 

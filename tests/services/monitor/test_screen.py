@@ -97,8 +97,8 @@ def test_slots_and_lost_processes_are_shown() -> None:
     ("version", "words"),
     [
         (1_207, "weights: current, 1 s old"),
-        (1_206, "1 version behind"),
-        (9, "1198 versions behind"),
+        (1_206, "weights: 1 behind, 1 s old"),
+        (9, "1198 behind"),
     ],
 )
 def test_the_age_of_an_actors_weights_is_shown(version: float, words: str) -> None:
