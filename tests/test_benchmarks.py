@@ -1,4 +1,4 @@
-"""Benchmarks print one line of JSON with what they promise; no figure in it is a verdict."""
+"""Benchmarks print one line of JSON with the promised fields; no figure in it is judged."""
 
 import json
 import os
@@ -61,7 +61,7 @@ def test_learner_measures_updates(
     assert all(learner.figure(result, size) > 0 for size in (2, 4))
 
 
-def test_learner_and_its_peer_take_turns(
+def test_learner_and_its_peer_alternate(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     peer = "import json, sys; print(json.dumps({'b2_updates_per_s': 32.5, 'argv': sys.argv}))"
@@ -71,16 +71,16 @@ def test_learner_and_its_peer_take_turns(
     argv = ["learner", "--peers", str(tmp_path), "--cores", cores, "--rounds", "1", *brief]
     monkeypatch.setattr(sys, "argv", argv)
     learner.main()
-    told = capsys.readouterr()
-    results = {line["system"]: line for line in map(json.loads, told.out.splitlines())}
+    printed_text = capsys.readouterr()
+    results = {line["system"]: line for line in map(json.loads, printed_text.out.splitlines())}
     assert list(results) == ["CleanRL, plain", "CleanRL, tuned", *learner.OURS]
     assert "--fused" in results["CleanRL, tuned"]["argv"]
     assert "--fused" not in results["CleanRL, plain"]["argv"]
     assert all(learner.figure(result, 2) > 0 for result in results.values())
-    assert "CleanRL, plain          b2     32.5" in told.err
+    assert "CleanRL, plain          b2     32.5" in printed_text.err
 
 
-def test_a_rival_that_ends_is_told_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_rival_that_exits_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rival = program(tmp_path / "python", "exit 3")
     monkeypatch.setattr(sys, "argv", ["arena", *map(str, BRIEF), "--pusht-python", str(rival)])
     with pytest.raises(RuntimeError, match="did not answer: exit code 3"):
