@@ -141,7 +141,7 @@ def test_what_diverged_reaches_nobody_and_the_last_good_checkpoint_stays(tmp_pat
     writer.publish.side_effect = published.append
     publisher = WeightsPublisher(config, learner, writer, tmp_path)
     told: list[dict[str, float]] = []
-    reporter.now.side_effect = lambda metrics: told.append(numbers(metrics()))
+    reporter.publish.side_effect = lambda metrics: told.append(numbers(metrics()))
     batches = [random_batch(seed=step) for step in range(3)] + [nan_batch()]
     with pytest.raises(DivergedError, match="by step 4"):
         run(
