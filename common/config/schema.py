@@ -353,6 +353,12 @@ class LearnerConfig(Section):
     best weights are kept as evaluated. (ours)"""
     checkpoint_period_s: Positive = 60.0
     """Time between checkpoints. (ours)"""
+    average_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Part of an exponential average of the parameters that a learner step keeps. Actors and
+    evaluators then act by the average, and the best one is kept; 0: no average. (ours)"""
+    initial_weights: str = ""
+    """Weights file or run directory from whose weights a new run starts: for other numbers of
+    robots, other targets, or a kind whose parameters are the same; empty: random. (ours)"""
     keep_checkpoints: Count = 3
     """Newest checkpoints kept; the evaluator keeps the best weights beside them. (ours)"""
     warn_s: Positive = 10.0

@@ -41,8 +41,10 @@ def weights_path(source: Path) -> Path:
     """
     if not source.is_dir():
         return source
-    checkpoints = sorted(source.glob("checkpoints/step_*/model.safetensors"), reverse=True)
-    for path in (source / BEST_WEIGHTS, *checkpoints, source / "model.safetensors"):
+    checkpoints = sorted(source.glob("checkpoints/step_*"), reverse=True)
+    published = ("average.safetensors", "model.safetensors")  # the average, where there is one
+    saved = (directory / name for directory in (*checkpoints, source) for name in published)
+    for path in (source / BEST_WEIGHTS, *saved):
         if path.is_file():
             return path
     raise CheckpointError(f"{source} holds no weights")

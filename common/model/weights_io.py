@@ -36,8 +36,10 @@ def weights_to_bytes(network: QNetwork, dtype: torch.dtype = torch.float32) -> b
     return write_safetensors(arrays, {_METADATA_KEY: json.dumps(_metadata(network))})
 
 
-def load_weights(network: QNetwork, payload: bytes) -> None:
+def load_weights(network: QNetwork, payload: bytes, *, any_kind: bool = False) -> None:
     """Set the network's parameters in place, cast up where they were sent in half precision.
+
+    any_kind: take weights of a network of another kind whose parameters fit.
 
     Raises CheckpointError, leaving the network as it was, if the payload is unreadable, belongs
     to another kind or shape of network, or holds a value that is not finite.
@@ -45,7 +47,7 @@ def load_weights(network: QNetwork, payload: bytes) -> None:
     metadata = _read_metadata(payload)
     expected = _metadata(network)
     for name, value in expected.items():
-        if metadata.get(name) != value:
+        if metadata.get(name) != value and not (any_kind and name == "kind"):
             raise CheckpointError(f"weights have {name} {metadata.get(name)!r}, not {value!r}")
     arrays = read_arrays(payload)
     own = network.state_dict()

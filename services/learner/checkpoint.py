@@ -2,6 +2,7 @@
 
     checkpoints/step_000001234/
         model.safetensors  target.safetensors  optimizer.safetensors  manifest.json
+        average.safetensors, where learner.average_decay asks for it
 
 Invariants: a directory gets its name once all of its files are on the disk; the manifest holds the
 digest of every file; a reader takes the newest directory whose digests are right and says which
@@ -30,6 +31,7 @@ FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
 _PREFIX = "step_"
 _FILES = ("model", "target", "optimizer")
+_AVERAGE = "average"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,9 @@ def latest(directory: Path) -> Path | None:
 def load(path: Path) -> Checkpoint:
     """One checkpoint, every digest verified; raises CheckpointError saying what is wrong."""
     manifest = _read_manifest(path)
-    contents = {name: _read_file(path / f"{name}.safetensors", manifest) for name in _FILES}
+    averaged = [_AVERAGE] if f"{_AVERAGE}.safetensors" in manifest["sha256"] else []
+    names = (*_FILES, *averaged)
+    contents = {name: _read_file(path / f"{name}.safetensors", manifest) for name in names}
     try:
         return Checkpoint(
             state=LearnerState(
@@ -97,6 +101,7 @@ def load(path: Path) -> Checkpoint:
                 target=contents["target"],
                 optimizer=contents["optimizer"],
                 rng_state=dict(manifest["rng_state"]),
+                average=contents.get(_AVERAGE, b""),
             ),
             weights_epoch=int(manifest["weights_epoch"]),
             weights_version=int(manifest["weights_version"]),
@@ -132,6 +137,8 @@ def load_latest(directory: Path) -> Loaded | None:
 def _write(folder: Path, checkpoint: Checkpoint) -> None:
     state = checkpoint.state
     contents = {"model": state.model, "target": state.target, "optimizer": state.optimizer}
+    if state.average:
+        contents[_AVERAGE] = state.average
     manifest = {
         "format_version": FORMAT_VERSION,
         "learner_step": state.learner_step,

@@ -21,6 +21,7 @@ from mrcdrl.common.model.q_network import QNetwork, precision, resolve_device
 from mrcdrl.common.model.weights_io import SENT_AS, load_weights, read_arrays, weights_to_bytes
 from mrcdrl.services.learner.accelerate.cuda_graphs import Capturer, capturer_for
 from mrcdrl.services.learner.accelerate.step import AcceleratedStep
+from mrcdrl.services.learner.average import ParameterAverage
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.step import MOMENTS, GradientStep, Update
 
@@ -34,6 +35,7 @@ class LearnerState:
     target: bytes  # weights
     optimizer: bytes  # safetensors: float32 by "<parameter>:<moment>"
     rng_state: dict[str, Any]  # of the symmetries' generator, as JSON takes it
+    average: bytes = b""  # weights; empty without an average
 
 
 class Learner:
@@ -67,6 +69,8 @@ class Learner:
         self.online = online.to(self.device)
         self.target = target.to(self.device).requires_grad_(requires_grad=False)
         self.target.load_state_dict(self.online.state_dict())
+        decay = learner.average_decay
+        self._average = ParameterAverage(self.online, decay) if decay else None
         self._step: GradientStep = AcceleratedStep(
             self.online,
             self.target,
@@ -115,14 +119,35 @@ class Learner:
             rates = [self._rate_at(self.learner_step + i) for i in range(len(following))]
             updates += self._step(following, rates)
             self.learner_step += len(following)
+            if self._average is not None:
+                self._average.update(self.online, self.learner_step, len(following))
             if self.learner_step % period == 0:
                 self.target.load_state_dict(self.online.state_dict())
                 self._step.target_changed()
         return updates
 
     def payload(self) -> bytes:
-        """The online parameters for publication; raises DivergedError if one is not finite."""
-        return self._to_bytes(self.online, self._sent_as)
+        """The parameters for publication: their average where the settings want one.
+
+        Raises DivergedError if one is not finite.
+        """
+        return self._to_bytes(self.published, self._sent_as)
+
+    @property
+    def published(self) -> QNetwork:
+        """The network whose parameters are published."""
+        return self.online if self._average is None else self._average.network
+
+    def start_from(self, payload: bytes) -> None:
+        """Begin with these weights in place of random ones, of a network of any kind that fits.
+
+        Raises CheckpointError if they do not fit.
+        """
+        load_weights(self.online, payload, any_kind=True)
+        self.target.load_state_dict(self.online.state_dict())
+        self._step.target_changed()
+        if self._average is not None:
+            self._average.reset(self.online)
 
     def state(self) -> LearnerState:
         """A copy of everything; raises DivergedError if a number of it is not finite."""
@@ -138,6 +163,7 @@ class Learner:
             target=self._to_bytes(self.target, torch.float32),
             optimizer=write_safetensors(moments),
             rng_state=dict(self.rng.bit_generator.state),
+            average=b"" if self._average is None else self._to_bytes(self.published, torch.float32),
         )
 
     def restore(self, state: LearnerState) -> None:
@@ -150,6 +176,8 @@ class Learner:
             raise CheckpointError(f"the checkpoint's rng_state is damaged: {error}") from error
         load_weights(self.target, state.target)
         load_weights(self.online, state.model)
+        if self._average is not None:
+            load_weights(self._average.network, state.average or state.model)
         self._step.restore(moments)
         self.learner_step = state.learner_step
         self.rng.bit_generator.state = rng.bit_generator.state

@@ -10,7 +10,9 @@ import time
 from pathlib import Path
 
 from mrcdrl.common.config import Config, to_toml
+from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.common.model.saved_policy import read_saved, weights_path
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.learner import Learner
@@ -42,6 +44,7 @@ class WeightsPublisher:
     def _restore(self) -> None:
         found = checkpoint.load_latest(self._directory)
         if found is None:
+            self._start_from(self._settings.initial_weights)
             return
         for reason in found.skipped:
             _LOG.warning("%s", reason)
@@ -49,6 +52,18 @@ class WeightsPublisher:
         self.epoch = found.checkpoint.weights_epoch
         self.version = found.checkpoint.weights_version
         _LOG.info("continuing from %s", found.path)
+
+    def _start_from(self, source: str) -> None:
+        """Give a new run its initial weights, if it is to have any."""
+        if not source:
+            return
+        path = weights_path(Path(source))
+        weights = read_saved(path)
+        try:
+            self._learner.start_from(weights.payload)
+        except CheckpointError as error:
+            raise CheckpointError(f"learner.initial_weights {path}: {error}") from error
+        _LOG.info("starting from %s, learner step %d there", path, weights.learner_step)
 
     def publish(self) -> None:
         """Publish the present parameters under the next version; returns at once.

@@ -32,6 +32,7 @@ def summary(state: RunState, config: Config, now: float, stop_reason: str) -> di
         "wall_s": round(now, 3),
         "num_robots": config.arena.num_robots,
         "agent": config.agent.kind,
+        "initial_weights": config.learner.initial_weights or None,
         "episodes": state.episodes,
         "env_steps": state.env_steps,
         "robot_steps": state.robot_steps,

@@ -13,7 +13,7 @@ from pathlib import Path
 from mrcdrl.common.arena import test_starts
 from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
-from mrcdrl.common.errors import EndpointError
+from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import COMMAND, StopSignal, available_cores
@@ -66,9 +66,13 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
 def check_possible(config: Config) -> None:
     """Refuse a run that no service could serve.
 
-    Raises ConfigError if the robots do not fit, EndpointError if a port is in use.
+    Raises ConfigError if the robots do not fit or the initial weights are missing, EndpointError if
+    a port is in use.
     """
     test_starts(config.arena, 1, config.evaluator.seed)
+    initial_weights = config.learner.initial_weights
+    if initial_weights and not Path(initial_weights).exists():
+        raise ConfigError(f"learner.initial_weights {initial_weights}: no such file or directory")
     if config.transport.listen:
         Session(config.transport.model_copy(update={"connect": ()})).close()
 

@@ -7,9 +7,10 @@ from unittest.mock import MagicMock
 import pytest
 
 from mrcdrl.common.config import load_config
+from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.services.learner.weights_publisher import WeightsPublisher
-from tests.services.learner.test_learner import make_learner
+from tests.services.learner.test_learner import make_learner, random_batch
 
 DAY_NS = 86_400 * 10**9
 
@@ -30,3 +31,35 @@ def test_a_clock_that_jumps_between_two_starts_turns_no_version_back(
     before, after = published
     assert after.epoch == before.epoch
     assert after.order > before.order
+
+
+def test_a_new_run_starts_from_its_initial_weights_and_a_resumed_one_does_not(
+    tmp_path: Path,
+) -> None:
+    source, writer = make_learner(), MagicMock()
+    source.step(random_batch())
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(source.payload())
+    settings = {"learner.initial_weights": str(path)}
+    config, learner = load_config("smoke", settings, environ={}), make_learner()
+    publisher = WeightsPublisher(config, learner, writer, tmp_path / "checkpoints")
+    assert learner.payload() == source.payload()
+    learner.step(random_batch(seed=1))
+    publisher.save()
+    path.unlink()
+    resumed = make_learner()
+    WeightsPublisher(config, resumed, writer, tmp_path / "checkpoints")
+    assert resumed.payload() == learner.payload() != source.payload()
+
+
+@pytest.mark.parametrize("content", [None, b"text"])
+def test_initial_weights_that_cannot_be_had_are_refused_by_name(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    path = tmp_path / "weights.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    config = load_config("smoke", {"learner.initial_weights": str(path)}, environ={})
+    with pytest.raises(CheckpointError, match=r"weights\.safetensors") as error:
+        WeightsPublisher(config, make_learner(), MagicMock(), tmp_path / "checkpoints")
+    assert "\n" not in str(error.value)
