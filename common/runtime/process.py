@@ -4,6 +4,7 @@ Invariants: SIGTERM and SIGINT set one StopSignal; errors raised on purpose end 
 line and their exit code; bugs crash with a traceback.
 """
 
+import contextlib
 import ctypes
 import logging
 import os
@@ -104,6 +105,20 @@ def last_line(log: Path) -> str:
     """The last line of a log, usually the reason why its service ended."""
     lines = log.read_text("utf-8", "replace").strip().splitlines()
     return lines[-1] if lines else "its log is empty"
+
+
+def yield_cores(nice: int, autogroup: Path = Path("/proc/self/autogroup")) -> None:
+    """Let other processes go first where cores are short: lower this process's priority.
+
+    nice: 1 ... 19 more than now. Where Linux schedules sessions as groups
+    (sched_autogroup_enabled), a process's own value counts within its session only, and the
+    session's counts against others. A process that leads its session sets that too; another one
+    would slow its terminal down.
+    """
+    level = os.nice(nice)
+    if os.getsid(0) == os.getpid():
+        with contextlib.suppress(OSError):  # not Linux, no groups, or a limit of the system
+            autogroup.write_text(f"{level}\n", "ascii")
 
 
 def available_cores() -> int:

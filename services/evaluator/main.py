@@ -1,11 +1,10 @@
 """`mrcdrl evaluator`: join a run and evaluate its live weights until told to stop."""
 
-import os
 from collections.abc import Sequence
 
 import torch
 
-from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal, yield_cores
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.evaluator import Evaluator
@@ -22,6 +21,6 @@ def main(argv: Sequence[str]) -> int:
         torch.set_num_threads(config.evaluator.threads)
         evaluator = Evaluator(config, joining, session, stop)
         session.announce(joining.keys.live("evaluator", joining.worker))
-        os.nice(_NICE)  # only now: a restart waits for the start-up
+        yield_cores(_NICE)  # only now: a restart waits for the start-up
         evaluator.run()
     return 0

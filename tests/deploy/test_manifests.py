@@ -144,6 +144,15 @@ def test_it_says_what_it_needs(name: str) -> None:
     assert set(resources["limits"]) == {"memory"}
 
 
+def test_an_evaluator_yields_to_learner_and_actors() -> None:
+    """A container's default is 1 024 shares; a request of CPU time is its weight in Kubernetes."""
+    shares = {
+        name: service.get("cpu_shares", 1024) for name, service in COMPOSE["services"].items()
+    }
+    assert min(shares, key=lambda name: shares[name]) == "evaluator"
+    assert shares["learner"] == shares["actor"] == 1024
+
+
 # -- what one takes from another ---------------------------------------------------------
 
 

@@ -1,8 +1,12 @@
-"""Signals: a service stops when told to, and does not outlive its deadline."""
+"""Signals and priorities: a service stops in time, and lets others go first where it should."""
 
+import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
 
 STUCK = """
 import sys, threading
@@ -36,3 +40,33 @@ def test_a_process_that_ends_in_time_ends_by_itself() -> None:
 
 def test_without_a_deadline_it_takes_its_time() -> None:
     assert run_stuck(0, 1.5) == (0, "listening\ntold\n")
+
+
+YIELDS = """
+import os
+from pathlib import Path
+from mrcdrl.common.runtime.process import yield_cores
+group = Path("/proc/self/autogroup")
+before = group.read_text() if group.exists() else ""
+yield_cores(3)
+print(os.nice(0), before != (group.read_text() if group.exists() else ""))
+"""
+
+
+@pytest.mark.parametrize("leads_its_session", [True, False])
+def test_a_process_yields_alone_or_with_the_session_it_leads(leads_its_session: bool) -> None:
+    """Where Linux groups by session, the group's own value counts against other sessions."""
+    result = subprocess.run(
+        [sys.executable, "-c", YIELDS],
+        start_new_session=leads_its_session,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    grouped = Path("/proc/self/autogroup").exists()
+    assert result.stdout.split() == [str(os.nice(0) + 3), str(grouped and leads_its_session)]
+
+
+def test_a_system_that_forbids_it_is_no_error(tmp_path: Path) -> None:
+    code = f"from mrcdrl.common.runtime.process import *; yield_cores(1, Path({str(tmp_path)!r}))"
+    subprocess.run([sys.executable, "-c", code], start_new_session=True, check=True)
