@@ -11,7 +11,7 @@ MrcdrlError
     ├── DeadlineError   a wait timed out; the message names the peer
     ├── SharedMemoryError  a peer's shared buffer is out of reach; the network serves instead
     └── RefusedError    the peer refused, and gave its reason
-        └── ThrottledError  the peer's rate limiter held the request; send it again
+        └── ThrottledError  the peer cannot serve the request now; send it again
 """
 
 
@@ -64,4 +64,8 @@ class RefusedError(TransportError):
 
 
 class ThrottledError(RefusedError):
-    """The peer's rate limiter held the request as long as it may; send it again."""
+    """The peer cannot serve the request now; send it again.
+
+    The message says why: the rate limiter, a full queue, a log that cannot be written, no weights
+    yet, or a shared buffer that the peer cannot open.
+    """

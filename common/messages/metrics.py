@@ -2,6 +2,11 @@
 
 Invariants: a field's name is the metric's name on the wire and in a run's records; its annotation
 says of what kind it is; a field that is None is not sent.
+
+A new metric is a field here, an argument where the service makes the object, and a row in
+docs/metrics.md, in the same order: ActorMetrics are made in services/actor/actor.py, ReplayMetrics
+in services/replay/service.py, LearnerMetrics in services/learner/timing.py, DiagnosticMetrics in
+services/learner/diagnostics.py, EvaluatorMetrics in services/evaluator/evaluator.py.
 """
 
 from collections.abc import Mapping
