@@ -4,27 +4,46 @@ A default is the paper's where the paper gives one ("paper"), that of the game i
 where that settles it ("ancestor"), and ours otherwise ("ours").
 """
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, Self, cast
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal, Self, cast
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 _FINEST_PX = 2.5  # arena px per image px; below, the literal renderer draws
 
+_LONGEST_S = 1e9  # thirty years; the system's waits overflow beyond nine times that
+LARGEST = 2**63 - 1  # whole number that TOML, torch and the wire all take
+
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, le=LARGEST)]
+Seconds = Annotated[float, Field(gt=0, le=_LONGEST_S)]
+Pause = Annotated[float, Field(ge=0, le=_LONGEST_S)]  # in seconds
+Reward = Annotated[float, Field(ge=-1e6, le=1e6)]  # sums of them are exact enough in float32
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Marks a setting that a resumed run keeps: its stored transitions or weights depend on it."""
+
+    in_lockstep: bool = False  # only where run.turn_size makes the numbers depend on it
 
 
 class Section(BaseModel):
-    """A section of the configuration: frozen, and strict about names."""
+    """A section of the configuration: frozen, finite, and strict about names."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False
+    )
+    kept: ClassVar[bool] = False  # whether a resumed run keeps all of its settings
 
 
 class ArenaConfig(Section):
     """The 2-D world, its rewards and its images (paper sections 3 and 4)."""
 
+    kept: ClassVar[bool] = True
     kind: Literal["robots", "counting"] = "robots"
     """`robots`: the paper's arena. `counting`: images that encode actor, episode and step, for
     tests of the data path. (ours)"""
@@ -73,11 +92,11 @@ class ArenaConfig(Section):
     back_off_frames: Annotated[int, Field(ge=0)] = 0
     """Frames that a robot drives backwards after a collision; 0: its move is undone instead.
     (ancestor: 10)"""
-    success_reward: float = 200
+    success_reward: Reward = 200
     """Reward to each robot. (paper)"""
-    collision_reward: float = -5
+    collision_reward: Reward = -5
     """(paper)"""
-    step_reward: float = 0.03
+    step_reward: Reward = 0.03
     """Reward off target and without a collision. (paper)"""
     proximity_weight: Fraction = 0.7
     """p in r = r_chi p + r_f (1 - p). (paper, Fig. 5)"""
@@ -168,17 +187,17 @@ class ArenaConfig(Section):
 class AgentConfig(Section):
     """The network and its update (paper sections 4 and 5.2)."""
 
-    kind: Literal["duel", "ddqn", "dqn"] = "duel"
+    kind: Annotated[Literal["duel", "ddqn", "dqn"], Kept()] = "duel"
     """`dqn`: target (4). `ddqn`: target (2). `duel`: target (2) and two streams (1). (paper)"""
-    gamma: Annotated[float, Field(gt=0, lt=1)] = 0.99
+    gamma: Annotated[float, Field(gt=0, lt=1), Kept()] = 0.99
     """(paper)"""
-    n_step: Annotated[int, Field(ge=1, le=32)] = 1
+    n_step: Annotated[int, Field(ge=1, le=32), Kept()] = 1
     """Rewards summed before the bootstrap. (paper: 1; Ape-X: 3)"""
-    reward_scale: Positive = 1.0
+    reward_scale: Annotated[Positive, Kept()] = 1.0
     """Factor on the rewards in the learner's target. (ours)"""
     loss: Literal["squared", "huber"] = "squared"
     """Loss of the TD error, Eq. (3). (paper: squared)"""
-    optimizer: Literal["adam", "rmsprop"] = "adam"
+    optimizer: Annotated[Literal["adam", "rmsprop"], Kept()] = "adam"
     """(ours; ancestor: rmsprop)"""
     learning_rate: Positive = 1e-4
     """(ours)"""
@@ -219,7 +238,7 @@ class ExplorationConfig(Section):
     slots: Annotated[int, Field(ge=0)] = 0
     """Exploration slots, the places of the ladder, each leased to one actor; 0: as many as actors
     hold one. (ours; Ape-X: as many as actors)"""
-    lease_s: Annotated[float, Field(ge=1)] = 15.0
+    lease_s: Annotated[float, Field(ge=1, le=_LONGEST_S)] = 15.0
     """Lease of an exploration slot: an actor that stays silent for longer loses it, and renews it
     three times as often. (ours)"""
 
@@ -236,12 +255,12 @@ class ReplayConfig(Section):
 
     capacity: Count = 400_000
     """Transitions that the table holds; new ones replace the oldest. (paper)"""
-    min_size: Count = 50_000
+    min_size: Annotated[Count, Kept(in_lockstep=True)] = 50_000
     """Transitions inserted before the first sample. (paper)"""
     capacity_bytes: Annotated[int, Field(ge=0)] = 0
     """Limit of the table's memory, allocated at the start; fewer transitions are kept if capacity
     would need more; 0: no limit. (ours)"""
-    shards: Count = 1
+    shards: Annotated[Count, Kept()] = 1
     """Replay processes that share capacity and min_size; an actor inserts into one, the learner
     samples from all. (ours)"""
     sampler: Literal["uniform", "prioritized"] = "uniform"
@@ -256,20 +275,20 @@ class ReplayConfig(Section):
     """beta after importance_anneal_steps. (Ape-X; prioritized replay's paper: 1)"""
     importance_anneal_steps: Count = 100_000
     """Learner steps over which beta changes linearly to its final value. (ours)"""
-    samples_per_insert: Annotated[float, Field(ge=0)] = 8.0
+    samples_per_insert: Annotated[float, Field(ge=0), Kept(in_lockstep=True)] = 8.0
     """Transitions sampled for each one inserted; both sides keep to it; 0: no limit. (ours)"""
     tolerance: Annotated[float, Field(ge=0)] = 0.1
     """Fraction of min_size x samples_per_insert by which either side may run ahead. (ours)"""
-    hold_s: Positive = 5.0
+    hold_s: Seconds = 5.0
     """Time after which a throttled request is answered "held"; the client asks again. (ours)"""
     fsync: Literal["never", "always", "off"] = "never"
     """When the log of accepted chunks is synced: with `never` it survives kill -9, with `always` a
     power cut too, at the disk's pace; `off` keeps no log. (ours)"""
     segment_bytes: Count = 64 << 20
     """Size at which the log starts a new file; files are deleted as the table evicts. (ours)"""
-    snapshot_period_s: Positive = 10.0
+    snapshot_period_s: Seconds = 10.0
     """Time between snapshots of the priorities and counters, which the log lacks. (ours)"""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the sampler. (ours)"""
 
     @model_validator(mode="after")
@@ -300,13 +319,13 @@ class ReplayConfig(Section):
 class ActorConfig(Section):
     """Collecting transitions."""
 
-    num_arenas: Count = 8
+    num_arenas: Annotated[Count, Kept(in_lockstep=True)] = 8
     """Arenas stepped together, with one batched inference for all their robots. (ours)"""
     chunk_length: Annotated[int, Field(ge=1, le=1024)] = 50
     """Transitions in a chunk. (Ape-X)"""
     spool_chunks: Count = 8
     """Unacknowledged chunks at which the arenas stop; nothing is dropped. (ours)"""
-    warn_s: Positive = 10.0
+    warn_s: Seconds = 10.0
     """Time without an acknowledgement after which the actor logs whom it waits for. (ours)"""
     device: str = "cpu"
     """Device of the policy; `auto`: cuda if available, else cpu. (ours)"""
@@ -317,7 +336,7 @@ class ActorConfig(Section):
 class LearnerConfig(Section):
     """Learning from samples."""
 
-    batch_size: Count = 32
+    batch_size: Annotated[Count, Kept(in_lockstep=True)] = 32
     """(paper)"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of convolutions and hidden layers; heads and loss are always float32. `auto`:
@@ -345,25 +364,25 @@ class LearnerConfig(Section):
     transition, its action included. (ours)"""
     publish_period: Count = 100
     """Learner steps between publications of the weights. (ours)"""
-    publish_interval_s: Annotated[float, Field(ge=0)] = 0.2
+    publish_interval_s: Pause = 0.2
     """Least time between publications: a fast learner skips some, which leaves their readers time
     to adopt them. Not with run.turn_size. (ours)"""
     publish_precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Precision of published weights: half precision halves their bytes, and readers cast up. The
     best weights are kept as evaluated. (ours)"""
-    checkpoint_period_s: Positive = 60.0
+    checkpoint_period_s: Seconds = 60.0
     """Time between checkpoints. (ours)"""
     average_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Part of an exponential average of the parameters that a learner step keeps. Actors and
     evaluators then act by the average, and the best one is kept; 0: no average. (ours)"""
-    initial_weights: str = ""
+    initial_weights: Annotated[str, Kept()] = ""
     """Weights file or run directory from whose weights a new run starts: for other numbers of
     robots, other targets, or a kind whose parameters are the same; empty: random. (ours)"""
     keep_checkpoints: Count = 3
     """Newest checkpoints kept; the evaluator keeps the best weights beside them. (ours)"""
-    warn_s: Positive = 10.0
+    warn_s: Seconds = 10.0
     """Time without a batch after which the learner logs whom it waits for. (ours)"""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the initial parameters and the random symmetries. (ours)"""
 
     @property
@@ -379,12 +398,15 @@ class EvaluatorConfig(Section):
     """Episodes of each evaluation; the paper's table has 1100. (ours)"""
     epsilon: Fraction = 0.01
     """(paper)"""
-    period_s: Annotated[float, Field(ge=0)] = 30.0
+    period_s: Pause = 30.0
     """Least time between the starts of two evaluations. (ours)"""
     max_share: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Greatest fraction of time spent evaluating: a wandering policy takes long. (ours)"""
-    seed: int = 1
+    seed: Seed = 1
     """Seed of the start states, which are the same for every version. (ours)"""
+    confirm_episodes: Annotated[int, Field(ge=0)] = 400
+    """Episodes, from other starts, of a second evaluation of weights that may be the best and have
+    90 % success: the best of many evaluations owes some of its score to luck; 0: none. (ours)"""
     threads: Count = 1
     """Torch threads. (ours)"""
 
@@ -396,9 +418,9 @@ class RunConfig(Section):
     """Actor processes; 0: derived from the number of cores. (ours)"""
     evaluators: Annotated[int, Field(ge=0)] = 1
     """Evaluator processes. (ours)"""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the arenas. (ours)"""
-    turn_size: Annotated[int, Field(ge=0)] = 0
+    turn_size: Annotated[int, Field(ge=0), Kept()] = 0
     """Lockstep: transitions that the one actor collects before the learner takes its turn; the same
     seeds then give the same numbers, even across restarts. 0: both run freely. (ours)"""
     minutes: Annotated[float, Field(ge=0)] = 0
@@ -429,7 +451,7 @@ class TransportConfig(Section):
     """This process's certificate, a PEM file; its common name is the role it may play. (ours)"""
     key: str = ""
     """Private key of the certificate, a PEM file. (ours)"""
-    timeout_s: Positive = 10.0
+    timeout_s: Seconds = 10.0
     """Deadline of one query. (ours)"""
     max_message_bytes: Count = 64 << 20
     """Largest message; larger ones are refused. (ours)"""
@@ -505,3 +527,15 @@ def sections() -> dict[str, type[Section]]:
     return {
         name: cast(type[Section], info.annotation) for name, info in Config.model_fields.items()
     }
+
+
+def kept_settings(*, lockstep: bool) -> Iterator[tuple[str, str]]:
+    """The section and name of each setting that a resumed run keeps.
+
+    lockstep: whether actor and learner take turns.
+    """
+    for section, model in sections().items():
+        for name, info in model.model_fields.items():
+            marks = [mark for mark in info.metadata if isinstance(mark, Kept)]
+            if model.kept or any(lockstep or not mark.in_lockstep for mark in marks):
+                yield section, name

@@ -12,7 +12,7 @@ from mrcdrl.common.model.policy import Policy, make_policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import SENT_AS, network_from_bytes, weights_to_bytes
-from mrcdrl.services.evaluator.evaluator import BestWeights
+from mrcdrl.services.evaluator.evaluator import BestWeights, WeightsEvaluator, confirming
 
 
 @pytest.fixture
@@ -104,3 +104,38 @@ def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     best = BestWeights(tmp_path / "checkpoints" / "best.safetensors")
     with pytest.raises(CheckpointError, match="not written"):
         offer(best, 0, 0.5, 50)
+
+
+@pytest.mark.parametrize(
+    ("offers", "expected"),
+    [
+        ([(0.95, 0.93), (0.98, 0.91)], 0),  # luck
+        ([(0.95, 0.93), (0.94, 0.96)], 1),  # bad luck at first
+        ([(0.95, 0.93), (0.92, 0.99)], 0),  # not worth a second look: below the confirmed best
+        ([(0.5, 0.1), (0.6, 0.0)], 1),  # below 90 % nothing is confirmed
+        ([(0.95, 0.93), (0.96, None)], 1),  # stopped meanwhile: the first evaluation counts
+    ],
+)
+def test_the_best_is_confirmed_and_not_drawn_by_luck(
+    path: Path, offers: list[tuple[float, float | None]], expected: int
+) -> None:
+    again = {v: None if r is None else result(v, r, 50) for v, (_, r) in enumerate(offers)}
+    best = BestWeights(path, lambda weights: again[weights.version])
+    for version, (rate, _) in enumerate(offers):
+        offer(best, version, rate, 50)
+    assert kept(path) == f"weights {expected}"
+    due = again[expected] if offers[expected][0] >= 0.9 else None
+    rate = offers[expected][0] if due is None else due.success_rate
+    assert read_weights(path)[1]["success_rate"] == rate
+
+
+def test_it_is_confirmed_from_other_starts_as_many_as_configured() -> None:
+    small = {"arena.view_px": "32", "arena.max_frames": "5", "evaluator.confirm_episodes": "6"}
+    config = load_config("smoke", small, environ={})
+    weights = Weights.of(0, 1, 10, weights_to_bytes(QNetwork("duel", view_px=32)))
+    found = WeightsEvaluator(confirming(config), "evaluator-0").evaluate(weights, lambda: True)
+    assert found is not None
+    assert found.episodes == 6
+    assert found.seed != config.evaluator.seed
+    config = load_config("smoke", {**small, "evaluator.confirm_episodes": "0"}, environ={})
+    assert WeightsEvaluator(confirming(config), "e").evaluate(weights, lambda: True) is None
