@@ -4,12 +4,12 @@ A message is one msgpack map: its fields by name, and `schema`, the message's na
 A number array is a pair [shape, bytes], C order, little-endian, of the dtype that `trajectory.py`
 declares; a large one follows the map (`framing.py`), and its pair is [shape, place].
 
-Invariants: what `decode` returns has exactly the declared types, dtypes and matching shapes; any
-other bytes raise WireError with the reason; large arrays are never copied.
+Invariants: what `decode` returns has exactly the declared types, dtypes and matching shapes, and
+values that `checks.py` allows; any other bytes raise WireError with the reason, in printable text;
+large arrays are never copied.
 """
 
 import enum
-import hashlib
 import math
 import types
 from collections.abc import Callable
@@ -20,14 +20,12 @@ import msgpack
 import numpy as np
 
 from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.checks import SENDERS, problem
 from mrcdrl.common.messages.framing import Part, join_map, padded, split_map
 from mrcdrl.common.messages.trajectory import (
-    NO_SLOT,
-    NUM_ACTIONS,
     Chunk,
     EpisodeSummary,
     Evaluation,
-    Float32Array,
     InsertReply,
     LeaseReply,
     LeaseRequest,
@@ -38,98 +36,11 @@ from mrcdrl.common.messages.trajectory import (
     Stats,
     Weights,
 )
-from mrcdrl.common.runtime.names import MAX_NAME
+from mrcdrl.common.runtime.names import printable
 
 M = TypeVar("M")
 _MAX_NDIM = 8
 _LARGE_BYTES = 8192  # arrays of this size or more follow the map
-
-
-def _check_chunk(chunk: Chunk) -> str | None:
-    arrays = (chunk.rewards, chunk.discounts, chunk.bootstrap_offsets)
-    if any(a.ndim != 1 for a in (chunk.actions, *arrays, chunk.priorities)):
-        return "actions, rewards, discounts, bootstrap_offsets and priorities are vectors"
-    length = len(chunk.actions)
-    if length == 0 or any(len(a) != length for a in arrays):
-        return "actions, rewards, discounts and bootstrap_offsets differ in length, or are empty"
-    if len(chunk.priorities) not in (0, length):
-        return "priorities is neither empty nor as long as actions"
-    if chunk.records.ndim != 2 or chunk.records.shape[0] <= length:
-        return "records is not a matrix with more rows than there are transitions"
-    if not (np.isfinite(chunk.rewards).all() and np.isfinite(chunk.discounts).all()):
-        return "a reward or discount is not finite"
-    if not _may_be_errors(chunk.priorities):
-        return "a priority is negative or not finite"
-    if chunk.actions.max() >= NUM_ACTIONS:
-        return f"an action is not below {NUM_ACTIONS}"
-    if chunk.bootstrap_offsets.min() < 1:
-        return "a bootstrap offset is 0"
-    if chunk.sequence < 0 or chunk.weights_version < 0:
-        return "sequence or weights_version is negative"
-    if len(chunk.actor) > MAX_NAME:  # replay remembers it
-        return f"actor has more than {MAX_NAME} characters"
-    return None
-
-
-def _check_samples(samples: Samples) -> str | None:
-    vectors = (
-        samples.keys,
-        samples.probabilities,
-        samples.actions,
-        samples.rewards,
-        samples.discounts,
-        samples.bootstrap_offsets,
-        samples.weights_versions,
-    )
-    if samples.records.ndim != 3 or any(v.ndim != 1 for v in vectors):
-        return "records does not have 3 dimensions, or another array is not a vector"
-    if any(len(v) != len(samples.records) for v in vectors):
-        return "arrays differ in length"
-    if not ((samples.probabilities > 0).all() and (samples.probabilities <= 1).all()):
-        return "a probability is not above 0 and at most 1"
-    if not 0 < samples.total_priority < math.inf:
-        return "total_priority is not above 0 and finite"
-    return None
-
-
-def _check_priorities(message: Priorities) -> str | None:
-    if message.keys.ndim != 1 or message.keys.shape != message.priorities.shape:
-        return "keys and priorities are not vectors of one length"
-    if not _may_be_errors(message.priorities):
-        return "a priority is negative or not finite"
-    return None
-
-
-def _check_lease_request(request: LeaseRequest) -> str | None:
-    if len(request.actor) > MAX_NAME:  # replay remembers it
-        return f"actor has more than {MAX_NAME} characters"
-    if request.slot < NO_SLOT:
-        return f"slot is below {NO_SLOT}"
-    if request.holds and request.slot == NO_SLOT:
-        return "holds is true, but slot names none"
-    return None
-
-
-def _check_lease_reply(reply: LeaseReply) -> str | None:
-    if reply.slot < NO_SLOT:
-        return f"slot is below {NO_SLOT}"
-    if not 0 <= reply.rank < reply.num_places:
-        return f"rank {reply.rank} is not among {reply.num_places} places"
-    if not 0 < reply.lease_s < math.inf:
-        return "lease_s is not above 0 and finite"
-    return None
-
-
-def _check_weights(weights: Weights) -> str | None:
-    if hashlib.sha256(weights.payload).hexdigest() != weights.digest:
-        return "the payload does not match its digest: torn or altered"
-    return None
-
-
-def _may_be_errors(priorities: Float32Array) -> bool:
-    """Whether these are absolute TD errors."""
-    return bool(np.isfinite(priorities).all() and (priorities >= 0).all())
-
 
 _SCHEMAS: dict[type, str] = {
     Chunk: "chunk/1",
@@ -144,14 +55,6 @@ _SCHEMAS: dict[type, str] = {
     EpisodeSummary: "episode/1",
     Evaluation: "evaluation/1",
     Stats: "stats/1",
-}
-_CHECKS: dict[type, Callable[[Any], str | None]] = {
-    Chunk: _check_chunk,
-    Samples: _check_samples,
-    Priorities: _check_priorities,
-    LeaseRequest: _check_lease_request,
-    LeaseReply: _check_lease_reply,
-    Weights: _check_weights,
 }
 
 
@@ -198,7 +101,7 @@ def decode(cls: type[M], data: Part) -> M:
     readers = _READERS[cls]
     if table.keys() != readers.keys():
         odd = sorted(map(str, table.keys() ^ readers.keys()))
-        raise WireError(f"missing or unknown fields: {', '.join(odd)[:120]}")
+        raise WireError(f"missing or unknown fields: {printable(', '.join(odd)[:120])[:150]}")
     values, end = {}, 0
     for name, read in readers.items():
         value = table[name]
@@ -214,9 +117,20 @@ def decode(cls: type[M], data: Part) -> M:
     if end != len(arrays):
         raise WireError(f"{len(arrays)} bytes after the map, of which {end} are arrays")
     message = cls(**values)
-    check = _CHECKS.get(cls)
-    if check is not None and (reason := check(message)) is not None:
+    if (reason := problem(message)) is not None:
         raise WireError(reason)
+    return message
+
+
+def decode_published(cls: type[M], key: str, data: Part) -> M:
+    """The message of class `cls` that was published on `key`.
+
+    Raises WireError as `decode` does, and if the key names another sender than the message.
+    """
+    message = decode(cls, data)
+    names = [getattr(message, name) for name in SENDERS[cls]]
+    if key.split("/")[-len(names) :] != names:
+        raise WireError(f"a message of {'/'.join(names)} on key {printable(key)}")
     return message
 
 

@@ -14,7 +14,7 @@ mrcdrl/<run>/live/<role>/<worker>      liveliness token
 
 from dataclasses import dataclass
 
-from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.runtime.names import MAX_NAME, check_name, printable
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +76,6 @@ class Keys:
 
 
 def role_and_worker(live_key: str) -> tuple[str, str]:
-    """The role and worker in a liveliness token's key."""
+    """The role and worker in a liveliness token's key, fit to be shown."""
     role, worker = live_key.split("/")[-2:]
-    return role, worker
+    return printable(role)[:MAX_NAME], printable(worker)[:MAX_NAME]

@@ -3,11 +3,12 @@
 import logging
 import time
 from collections.abc import Callable
+from itertools import chain
 from typing import TypeVar
 
 from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Stats
-from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.messages.wire import decode_published
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys, role_and_worker
 from mrcdrl.services.monitor.recorder import Recorder
@@ -57,14 +58,12 @@ class Follower:
         """Take in all that has arrived, waiting up to `timeout_s` for statistics; whether any
         arrived."""
         first = self._stats.take(timeout_s)
-        if first is not None:
-            self._take(Stats, first[1], lambda s: self._state.observe_stats(s, self.now))
-        for _, payload in self._stats.drain():
-            self._take(Stats, payload, lambda s: self._state.observe_stats(s, self.now))
-        for _, payload in self._episodes.drain():
-            self._take(EpisodeSummary, payload, self._observe_episode)
-        for _, payload in self._evaluations.drain():
-            self._take(Evaluation, payload, self._observe_evaluation)
+        for item in chain([first] if first else [], self._stats.drain()):
+            self._take(Stats, item, lambda s: self._state.observe_stats(s, self.now))
+        for item in self._episodes.drain():
+            self._take(EpisodeSummary, item, self._observe_episode)
+        for item in self._evaluations.drain():
+            self._take(Evaluation, item, self._observe_evaluation)
         for key, alive in self._presence.changes():
             self._state.observe_presence(*role_and_worker(key), alive)
         if self._recorder and self.lived_s >= self._record_due_s:
@@ -74,7 +73,8 @@ class Follower:
 
     def stop_reason(self) -> str | None:
         """Why the run should end now, or None; minutes count from this start."""
-        return self._rule.reason(self._state.learner_steps, self.lived_s / 60)
+        state = self._state
+        return self._rule.reason(state.learner_steps, self.lived_s / 60, state.published)
 
     def _observe_episode(self, episode: EpisodeSummary) -> None:
         self._state.observe_episode(episode)
@@ -88,8 +88,8 @@ class Follower:
         if self._recorder:
             self._recorder.record_evaluation(record)
 
-    def _take(self, cls: type[M], payload: bytes, observe: Callable[[M], None]) -> None:
+    def _take(self, cls: type[M], item: tuple[str, bytes], observe: Callable[[M], None]) -> None:
         try:
-            observe(decode(cls, payload))
+            observe(decode_published(cls, *item))
         except WireError as error:
             _LOG.warning("%s message refused: %s", cls.__name__, error)

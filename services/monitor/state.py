@@ -202,6 +202,11 @@ class RunState:
         return int(self._known("learner", "weights_version"))
 
     @property
+    def published(self) -> tuple[float, int]:
+        """Epoch and version of the last published weights; the epoch rounded, as a metric is."""
+        return self._known("learner", "weights_epoch"), self.weights_version
+
+    @property
     def inserts(self) -> int:
         return int(self._known("replay", "inserts"))
 

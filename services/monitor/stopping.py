@@ -1,7 +1,7 @@
 """When a run ends by itself: enough time, steps or success, or the paper's patience.
 
 Invariants: no clock inside; a limit of 0 is off; the limits are checked in a fixed order, so the
-same run always ends for the same reason.
+same run always ends for the same reason; an evaluation counts once its weights are published.
 """
 
 from collections import deque
@@ -36,14 +36,21 @@ class StoppingRule:
             self._maximum, self._maximum_at = successes, self._episodes
 
     def observe_evaluation(self, evaluation: Evaluation) -> None:
-        target = self._run.target_success_rate
-        if target and self._reached is None and evaluation.success_rate >= target:
+        target, known = self._run.target_success_rate, self._reached
+        earliest = known is None or _order(evaluation) < _order(known)
+        if target and evaluation.success_rate >= target and earliest:
             self._reached = evaluation
 
-    def reason(self, learner_steps: int, minutes: float) -> str | None:
-        """Why the run is over; None while it goes on."""
+    def reason(
+        self, learner_steps: int, minutes: float, published: tuple[float, int]
+    ) -> str | None:
+        """Why the run is over; None while it goes on.
+
+        published: epoch and version of the learner's last publication. An evaluation of later ones
+        is no evaluation of this run's, or not yet.
+        """
         run = self._run
-        if self._reached is not None:
+        if self._reached is not None and _order(self._reached) <= published:
             return (
                 f"evaluation success {self._reached.success_rate:.3f} reached "
                 f"run.target_success_rate {run.target_success_rate:g}"
@@ -60,3 +67,8 @@ class StoppingRule:
                 f"in {since} episodes (run.patience_episodes)"
             )
         return None
+
+
+def _order(evaluation: Evaluation) -> tuple[float, int]:
+    """The evaluated weights' place among all; the epoch as the learner's metrics have it."""
+    return float(evaluation.weights_epoch), evaluation.weights_version

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from mrcdrl.common.config import Config, TransportConfig
 from mrcdrl.common.errors import EndpointError, TransportError, WireError
 from mrcdrl.common.messages.trajectory import Stats
-from mrcdrl.common.messages.wire import decode
+from mrcdrl.common.messages.wire import decode_published
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.versions import versions
 from mrcdrl.common.sync.joining import Joining, fetch_config
@@ -69,7 +69,7 @@ def listen(heard: QueueSubscriber, seconds: float) -> dict[str, tuple[Stats, flo
         if item is None:
             break
         try:
-            stats = decode(Stats, item[1])
+            stats = decode_published(Stats, *item)
             ahead_s = (time.time_ns() - int(stats.text["clock_ns"])) / 1e9
         except (WireError, KeyError, ValueError):
             continue

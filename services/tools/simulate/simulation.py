@@ -21,7 +21,7 @@ import numpy as np
 
 from mrcdrl.common.errors import MrcdrlError, WireError
 from mrcdrl.common.messages.trajectory import Float64Array, Stats
-from mrcdrl.common.messages.wire import decode, encode_parts
+from mrcdrl.common.messages.wire import decode_published, encode_parts
 from mrcdrl.common.runtime.process import StopSignal, available_cores
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
@@ -182,7 +182,7 @@ class Simulation:
         item = self._stats.take(_TICK_S)
         if item is not None:
             try:
-                stats = decode(Stats, item[1])
+                stats = decode_published(Stats, *item)
             except WireError:
                 return
             self._replays[stats.id] = stats.metrics

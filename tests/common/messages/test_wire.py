@@ -33,10 +33,12 @@ from mrcdrl.common.messages.trajectory import (
 from mrcdrl.common.messages.wire import decode, encode, encode_parts
 
 INTS = st.integers(-(2**63), 2**63 - 1)
-COUNTS = st.integers(0, 2**63 - 1)
-FLOATS = st.floats(allow_nan=False)
+COUNTS = st.integers(0, 2**53)
+TIMES_NS = st.integers(0, 2**63 - 1)
+NUMBERS = st.floats(-(2.0**53), 2.0**53)
 SHARES = st.floats(0, 1)
-NAMES = st.text(max_size=20)
+NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,19}", fullmatch=True)
+TEXTS = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20)
 
 
 def arrays(dtype: str, *shape: int, **numbers: Any) -> st.SearchStrategy[Any]:
@@ -60,7 +62,7 @@ def chunks(draw: st.DrawFn) -> Chunk:
         records=draw(arrays("u1", length + tail, record_bytes)),
         actions=draw(npst.arrays("u1", (length,), elements=st.integers(0, 2))),
         rewards=draw(arrays("f4", length, **FINITE)),
-        discounts=draw(arrays("f4", length, **FINITE)),
+        discounts=draw(arrays("f4", length, min_value=0, max_value=1)),
         bootstrap_offsets=draw(npst.arrays("u1", (length,), elements=st.integers(1, 255))),
         priorities=draw(arrays("f4", length if prioritized else 0, min_value=0, **FINITE)),
     )
@@ -72,13 +74,13 @@ def samples(draw: st.DrawFn) -> Samples:
     return Samples(
         keys=draw(arrays("i8", size)),
         probabilities=draw(arrays("f8", size, min_value=1e-300, max_value=1)),
-        table_size=draw(COUNTS),
+        table_size=draw(st.integers(1, 2**53)),
         total_priority=draw(st.floats(1e-300, 1e300)),
         records=draw(arrays("u1", size, window, record_bytes)),
-        actions=draw(arrays("u1", size)),
+        actions=draw(npst.arrays("u1", (size,), elements=st.integers(0, 2))),
         rewards=draw(arrays("f4", size, **FINITE)),
-        discounts=draw(arrays("f4", size, **FINITE)),
-        bootstrap_offsets=draw(arrays("u1", size)),
+        discounts=draw(arrays("f4", size, min_value=0, max_value=1)),
+        bootstrap_offsets=draw(npst.arrays("u1", (size,), elements=st.integers(1, 255))),
         weights_versions=draw(arrays("i8", size)),
     )
 
@@ -95,45 +97,53 @@ def priorities(draw: st.DrawFn) -> Priorities:
 EPISODES = st.builds(
     EpisodeSummary,
     actor=NAMES,
-    arena=INTS,
-    episode=INTS,
+    arena=COUNTS,
+    episode=COUNTS,
     outcome=st.sampled_from(Outcome),
-    frames=INTS,
-    score=FLOATS,
-    collisions=INTS,
-    epsilon=FLOATS,
-    weights_version=INTS,
-    mean_q=FLOATS,
+    frames=COUNTS,
+    score=NUMBERS,
+    collisions=COUNTS,
+    epsilon=SHARES,
+    weights_version=COUNTS,
+    mean_q=st.floats(allow_nan=False),
 )
-EVALUATIONS = st.builds(
-    Evaluation,
-    worker=NAMES,
-    weights_epoch=INTS,
-    weights_version=INTS,
-    learner_step=INTS,
-    num_robots=INTS,
-    episodes=INTS,
-    success_rate=SHARES,
-    collision_rate=SHARES,
-    timeout_rate=SHARES,
-    success_interval=st.tuples(SHARES, SHARES),
-    max_per_100=FLOATS,
-    mean_per_100=FLOATS,
-    variance_per_100=FLOATS,
-    mean_frames=FLOATS,
-    mean_score=FLOATS,
-    seed=INTS,
-    wall_s=FLOATS,
-)
+
+
+@st.composite
+def evaluations(draw: st.DrawFn) -> Evaluation:
+    success = draw(SHARES)
+    collision = draw(st.floats(0, 1 - success))
+    low, high = sorted(draw(st.tuples(SHARES, SHARES)))
+    return Evaluation(
+        worker=draw(NAMES),
+        weights_epoch=draw(TIMES_NS),
+        weights_version=draw(COUNTS),
+        learner_step=draw(COUNTS),
+        num_robots=draw(st.integers(1, 10)),
+        episodes=draw(st.integers(1, 2**53)),
+        success_rate=success,
+        collision_rate=collision,
+        timeout_rate=1 - success - collision,
+        success_interval=(low, high),
+        max_per_100=draw(st.floats(0, 100)),
+        mean_per_100=draw(st.floats(0, 100)),
+        variance_per_100=draw(st.floats(0, 2500)),
+        mean_frames=draw(st.floats(0, 2.0**53)),
+        mean_score=draw(NUMBERS),
+        seed=draw(INTS),
+        wall_s=draw(st.floats(0, 2.0**53)),
+    )
+
+
 MESSAGES = st.one_of(
     chunks(),
     samples(),
     priorities(),
     EPISODES,
-    EVALUATIONS,
-    st.builds(InsertReply, sequence=INTS, duplicate=st.booleans(), inserts=INTS),
+    evaluations(),
+    st.builds(InsertReply, sequence=TIMES_NS, duplicate=st.booleans(), inserts=COUNTS),
     st.builds(SampleRequest, batch_size=INTS),
-    st.builds(PrioritiesReply, updated=INTS, ignored=INTS),
+    st.builds(PrioritiesReply, updated=COUNTS, ignored=COUNTS),
     st.builds(
         LeaseRequest,
         actor=NAMES,
@@ -149,13 +159,13 @@ MESSAGES = st.one_of(
         num_places=st.integers(10, 99),
         lease_s=st.floats(0.1, 1e6),
     ),
-    st.builds(Weights.of, epoch=INTS, version=INTS, learner_step=INTS, payload=st.binary()),
+    st.builds(Weights.of, epoch=TIMES_NS, version=COUNTS, learner_step=COUNTS, payload=st.binary()),
     st.builds(
         Stats,
         role=NAMES,
         id=NAMES,
-        metrics=st.dictionaries(NAMES, FLOATS, max_size=5),
-        text=st.dictionaries(NAMES, NAMES, max_size=5),
+        metrics=st.dictionaries(NAMES, st.floats(allow_nan=False), max_size=5),
+        text=st.dictionaries(NAMES, TEXTS, max_size=5),
     ),
 )
 CLASSES = (
@@ -310,7 +320,7 @@ MALFORMED = {
     "too few records": (Chunk, changed(CHUNK, records=[[2, 4], b"a" * 8]), "not a matrix"),
     "actions a number": (Chunk, changed(CHUNK, actions=[[], b"\1"]), "are vectors"),
     "priorities a number": (Chunk, changed(CHUNK, priorities=[[], b"\0" * 4]), "are vectors"),
-    "long name": (Chunk, changed(CHUNK, actor="a" * 65), "more than 64 characters"),
+    "long name": (Chunk, changed(CHUNK, actor="a" * 65), "actor is not a name of up to 64"),
     "sampled actions a number": (Samples, changed(SAMPLES, actions=[[], b"\1"]), "is not a vector"),
     "sampled records a matrix": (
         Samples,
@@ -331,7 +341,7 @@ MALFORMED = {
         "or are empty",
     ),
     "NaN reward": (Chunk, changed(CHUNK, rewards=floats(1, np.nan)), "not finite"),
-    "infinite discount": (Chunk, changed(CHUNK, discounts=floats(1, np.inf)), "not finite"),
+    "infinite discount": (Chunk, changed(CHUNK, discounts=floats(1, np.inf)), "outside 0 ... 1"),
     "negative priority": (Chunk, changed(CHUNK, priorities=floats(1, -1)), "priority is negative"),
     "one priority of two": (Chunk, changed(CHUNK, priorities=floats(1)), "priorities is neither"),
     "offset 0": (Chunk, changed(CHUNK, bootstrap_offsets=octets(1, 0)), "offset is 0"),
@@ -358,7 +368,7 @@ MALFORMED = {
         changed(PRIORITIES, priorities=floats(1, np.inf)),
         "not finite",
     ),
-    "wish of a long name": (LeaseRequest, changed(WISH, actor="a" * 65), "64 characters"),
+    "wish of a long name": (LeaseRequest, changed(WISH, actor="a" * 65), "not a name of up to 64"),
     "wish for slot -2": (LeaseRequest, changed(WISH, slot=-2), "slot is below -1"),
     "wish that holds none": (LeaseRequest, changed(WISH, slot=-1), "slot names none"),
     "lease of slot -2": (LeaseReply, changed(LEASE, slot=-2), "slot is below -1"),
@@ -465,7 +475,7 @@ def test_a_malformed_message_is_refused_with_its_reason(name: str) -> None:
 
 def test_whole_numbers_are_numbers() -> None:
     """A peer in another language may send them, even in a pair that is not an array."""
-    shares = dict.fromkeys(("success_rate", "collision_rate", "timeout_rate"), 0.5)
+    shares = {"success_rate": 0.5, "collision_rate": 0.5, "timeout_rate": 0}
     rest = {f.name: 1 for f in dataclasses.fields(Evaluation)}
     sent = {**rest, **shares, "schema": "evaluation/1", "worker": "e", "success_interval": [0, 1]}
     found = decode(Evaluation, msgpack.packb(sent))

@@ -110,7 +110,7 @@ def test_the_stopping_rule_is_fed_with_the_past(tmp_path: Path) -> None:
     rule = StoppingRule(run)
     with Recorder(tmp_path, CONFIG) as recorder:
         recorder.restore(RunState(CONFIG), rule)
-    assert rule.reason(0, 0.0) is not None
+    assert rule.reason(0, 0.0, (9.0, 9)) is not None
 
 
 def test_a_value_that_is_not_finite_is_strict_json(tmp_path: Path) -> None:

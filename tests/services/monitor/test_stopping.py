@@ -6,6 +6,7 @@ from mrcdrl.common.config import RunConfig
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
 from mrcdrl.services.monitor.stopping import StoppingRule
 
+NOTHING = (0.0, 0)  # published
 WON, LOST = Outcome.SUCCESS, Outcome.COLLISION
 
 
@@ -13,9 +14,25 @@ def episode(outcome: Outcome) -> EpisodeSummary:
     return EpisodeSummary("actor-0", 0, 0, outcome, 100, 150.0, 1, 0.1, 5, 2.0)
 
 
-def evaluation(rate: float) -> Evaluation:
+def evaluation(rate: float, epoch: int = 1, version: int = 1) -> Evaluation:
     return Evaluation(
-        "0", 1, 1, 100, 2, 100, rate, 1 - rate, 0.0, (0.0, 1.0), 1.0, 1.0, 1.0, 1.0, 1.0, 1, 1.0
+        "0",
+        epoch,
+        version,
+        100,
+        2,
+        100,
+        rate,
+        1 - rate,
+        0.0,
+        (0.0, 1.0),
+        1.0,
+        1.0,
+        1.0,
+        1.0,
+        1.0,
+        1,
+        1.0,
     )
 
 
@@ -24,7 +41,7 @@ def stopped_after(run: RunConfig, outcomes: list[Outcome]) -> int | None:
     rule = StoppingRule(run)
     for count, outcome in enumerate(outcomes, 1):
         rule.observe_episode(episode(outcome))
-        if rule.reason(0, 0.0) is not None:
+        if rule.reason(0, 0.0, NOTHING) is not None:
             return count
     return None
 
@@ -67,6 +84,19 @@ def test_other_rules(
     rule = StoppingRule(run)
     for rate in rates:
         rule.observe_evaluation(evaluation(rate))
-    reason = rule.reason(steps, minutes)
+    reason = rule.reason(steps, minutes, (1.0, 1))
     assert (reason is None) == (expected is None)
     assert expected is None or expected in str(reason)
+
+
+def test_an_evaluation_of_weights_never_published_ends_no_run() -> None:
+    """However early it comes: an evaluator may also be quicker than the learner's statistics."""
+    rule = StoppingRule(RunConfig(target_success_rate=0.9))
+    rule.observe_evaluation(evaluation(1.0, 10**18 + 1, 10**9))
+    rule.observe_evaluation(evaluation(1.0, 10**18 + 2**20, 0))
+    epoch = float(10**18 + 1)
+    assert rule.reason(0, 0.0, NOTHING) is None
+    assert rule.reason(0, 0.0, (epoch, 10**8)) is None
+    rule.observe_evaluation(evaluation(0.95, 10**18 + 1, 7))
+    assert rule.reason(0, 0.0, (epoch, 6)) is None
+    assert "success 0.950 reached" in str(rule.reason(0, 0.0, (epoch, 7)))

@@ -15,7 +15,7 @@ from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.doctor.main import main
-from mrcdrl.services.tools.doctor.run import clocks, endpoints, same_versions, services
+from mrcdrl.services.tools.doctor.run import clocks, endpoints, listen, same_versions, services
 
 RUN = "looked-at"
 IDLE = EvaluatorMetrics(evaluations=0, weights_version=0, busy=0)
@@ -148,3 +148,12 @@ def test_versions_of_a_run() -> None:
     found = same_versions({"a": {**ours, "zenoh": "1.0.0"}}, ours)
     assert found.verdict == "warning"
     assert "a has zenoh 1.0.0" in found.said
+
+
+def test_statistics_on_the_key_of_another_are_not_heard(run: Run) -> None:
+    with Session(TransportConfig(connect=(run.endpoint,))) as session:
+        heard = session.queue_subscriber(run.keys.every_stats)
+        publisher = session.publisher(run.keys.stats("actor", "a"))
+        for name in ("b", "a"):
+            StatsReporter(publisher, "actor", name).publish(lambda: IDLE)
+        assert list(listen(heard, 3.0)) == ["a"]

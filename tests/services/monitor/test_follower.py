@@ -1,0 +1,85 @@
+"""A follower believes of a publication only what its key and the checks allow."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from mrcdrl.common.config import Config, RunConfig, TransportConfig
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys, role_and_worker
+from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.stopping import StoppingRule
+
+KEYS = Keys("followed")
+CONFIG = Config(run=RunConfig(target_success_rate=0.9))
+EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
+
+
+def learner(version: float) -> Stats:
+    return Stats("learner", "0", {"weights_epoch": 7.0, "weights_version": version})
+
+
+def judged(version: int) -> Evaluation:
+    counts = (5.0, 5.0, 0.0, 9.0, 1.0, 0, 1.0)
+    return Evaluation("e", 7, version, 100, 2, 10, 1.0, 0.0, 0.0, (0.7, 1.0), *counts)
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    with Session(TransportConfig(listen=(free_endpoint(),))) as opened:
+        yield opened
+
+
+def listen_until(follower: Follower, heard: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60.0
+    while not heard():
+        assert time.monotonic() < deadline
+        follower.listen(0.05)
+
+
+def test_a_message_on_the_key_of_another_is_refused(
+    session: Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    state = RunState(CONFIG)
+    follower = Follower(session, KEYS, state, None, StoppingRule(CONFIG.run))
+    caplog.set_level(logging.WARNING)
+    session.publisher(KEYS.stats("learner", "x1")).put(encode(learner(10**6)))
+    session.publisher(KEYS.stats("actor", "0")).put(encode(learner(10**6)))
+    session.publisher(KEYS.episodes("b")).put(encode(EPISODE))
+    session.publisher(KEYS.evaluation("b")).put(encode(judged(1)))
+    session.publisher(KEYS.stats("learner", "0")).put(encode(learner(5)))
+    session.publisher(KEYS.episodes("a")).put(encode(EPISODE))
+    session.publisher(KEYS.evaluation("e")).put(encode(judged(2)))
+    listen_until(follower, lambda: bool(state.evaluations and state.episodes and state.services))
+    assert [(s.role, s.id) for s in state.services] == [("learner", "0")]
+    assert (state.published, state.episodes, len(state.evaluations)) == ((7.0, 5), 1, 1)
+    refused = [r.getMessage() for r in caplog.records if "refused" in r.getMessage()]
+    assert len(refused) == 4
+    assert any("a message of learner/0 on key mrcdrl/followed/stats/actor/0" in r for r in refused)
+
+
+def test_the_run_ends_by_an_evaluation_once_its_weights_are_published(session: Session) -> None:
+    state = RunState(CONFIG)
+    follower = Follower(session, KEYS, state, None, StoppingRule(CONFIG.run))
+    session.publisher(KEYS.evaluation("e")).put(encode(judged(9)))
+    listen_until(follower, lambda: bool(state.evaluations))
+    assert follower.stop_reason() is None
+    statistics = session.publisher(KEYS.stats("learner", "0"))
+    statistics.put(encode(learner(8)))
+    listen_until(follower, lambda: state.weights_version == 8)
+    assert follower.stop_reason() is None
+    statistics.put(encode(learner(9)))
+    listen_until(follower, lambda: state.weights_version == 9)
+    assert "run.target_success_rate" in str(follower.stop_reason())
+
+
+def test_the_name_in_a_liveliness_token_is_printable() -> None:
+    role, worker = role_and_worker("mrcdrl/run/live/act\x1bor/" + "\n" * 1000)
+    assert (role + worker).isprintable()
+    assert len(worker) <= 64
+    assert role_and_worker(KEYS.live("actor", "a-0")) == ("actor", "a-0")
