@@ -7,6 +7,7 @@ from mrcdrl.common.runtime.process import run_main
 
 _COMMANDS = {
     "train": ("mrcdrl.services.train.main", "train on this machine: all processes, one command"),
+    "experiment": ("mrcdrl.services.tools.experiment.main", "train a grid: settings and seeds"),
     "evaluate": (
         "mrcdrl.services.tools.evaluate",
         "run the paper's test on weights or a controller",

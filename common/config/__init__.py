@@ -2,11 +2,11 @@
 
 from mrcdrl.common.config.load import (
     DEFAULT_PRESET,
-    ENV_PREFIX,
     apply_overrides,
     load_config,
     load_transport,
     preset_names,
+    resolved_environment,
     validate_config,
 )
 from mrcdrl.common.config.schema import (
@@ -24,7 +24,6 @@ from mrcdrl.common.config.toml import to_toml
 
 __all__ = [
     "DEFAULT_PRESET",
-    "ENV_PREFIX",
     "AgentConfig",
     "ArenaConfig",
     "Config",
@@ -37,6 +36,7 @@ __all__ = [
     "load_config",
     "load_transport",
     "preset_names",
+    "resolved_environment",
     "sections",
     "to_toml",
     "validate_config",

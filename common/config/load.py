@@ -118,6 +118,16 @@ def environment_overrides(environ: Mapping[str, str]) -> dict[str, str]:
     }
 
 
+def resolved_environment() -> dict[str, str]:
+    """This process's environment without settings: for processes whose configuration is a file
+    that holds them already, and where a flag may have overridden them."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not (name.startswith(ENV_PREFIX) and "__" in name)
+    }
+
+
 def load_config(
     source: str | None = None,
     overrides: Mapping[str, str] | None = None,

@@ -5,7 +5,6 @@ so that Ctrl-C reaches the launcher only, and ends with the launcher, however th
 """
 
 import logging
-import os
 import signal
 import subprocess
 import time
@@ -13,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from mrcdrl.common.config import ENV_PREFIX
+from mrcdrl.common.config import resolved_environment
 from mrcdrl.common.errors import DivergedError, MrcdrlError
 from mrcdrl.common.runtime.process import ALLOCATOR, last_line, start_service
 
@@ -133,13 +132,3 @@ class Fleet:
     def _signal(self, process: ManagedProcess, number: int) -> None:
         if process.popen is not None and process.popen.poll() is None:
             process.popen.send_signal(number)
-
-
-def resolved_environment() -> dict[str, str]:
-    """This process's environment without settings: the run's config.toml holds them already, and
-    a flag may have overridden them."""
-    return {
-        name: value
-        for name, value in os.environ.items()
-        if not (name.startswith(ENV_PREFIX) and "__" in name)
-    }

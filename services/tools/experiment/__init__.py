@@ -1,0 +1,1 @@
+"""Experiments: grids of runs, with what they reached in one table."""

@@ -1,0 +1,97 @@
+"""`mrcdrl experiment`: train every cell of a grid, and say in one table what each variant reached.
+
+Invariants: killed at any moment, the same command goes on where it was; what is done is never run
+again.
+"""
+
+import argparse
+import fnmatch
+import logging
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from pathlib import Path
+
+from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.errors import ConfigError, RunDirectoryError
+from mrcdrl.common.runtime.files import atomic_write, reason
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.services.monitor.records import to_line
+from mrcdrl.services.tools.experiment.cell import CellFiles
+from mrcdrl.services.tools.experiment.grid import read_grid
+from mrcdrl.services.tools.experiment.runner import run_cells
+from mrcdrl.services.tools.experiment.table import table
+
+_LOG = logging.getLogger("experiment")
+_RESULTS = "results.jsonl"
+_REPORT_S = 30.0
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the cells; return the exit code: 0 if all that were asked for are done."""
+    arguments = _parse(argv)
+    out = arguments.out or Path("runs") / "experiments" / arguments.grid.stem
+    every = [CellFiles(cell, out) for cell in read_grid(arguments.grid)]
+    asked = [f for f in every if fnmatch.fnmatchcase(f.cell.name, arguments.only)]
+    if not asked:
+        names = ", ".join(files.cell.name for files in every)
+        raise ConfigError(f"no cell is named like {arguments.only!r}; the cells are {names}")
+    if arguments.list:
+        sys.stdout.writelines(f"{files.state:<8} {files.cell.name}\n" for files in asked)
+        return 0
+    stop = StopSignal().listen()
+    command = " ".join(["mrcdrl experiment", *argv])
+    try:
+        (out / "cells").mkdir(parents=True, exist_ok=True)
+        run_cells(asked, arguments.jobs, command, stop, _reporter(asked))
+        results = [result for result in (files.result() for files in every) if result]
+        atomic_write(out / _RESULTS, "".join(map(to_line, results)).encode())
+    except OSError as error:
+        raise RunDirectoryError(f"{out} cannot be written: {reason(error)}") from error
+    sys.stdout.write(table(every))
+    _LOG.info("%d of %d results are in %s", len(results), len(every), out / _RESULTS)
+    return 0 if all(files.result() for files in asked) else 1
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser(prog="mrcdrl experiment", description="Train a grid: settings and seeds.")
+    parser.add_argument("grid", type=Path, help="a TOML file: see docs/experiments.md")
+    parser.add_argument("--out", type=Path, help="folder of results; runs/experiments/GRID")
+    parser.add_argument("--jobs", type=int, default=1, help="cells at once; default: 1")
+    parser.add_argument("--only", metavar="PATTERN", default="*", help="cells named so, as 'x-*'")
+    parser.add_argument("--list", action="store_true", help="print each cell's state, do nothing")
+    arguments = parser.parse_args(argv)
+    if arguments.jobs < 1:
+        parser.error(f"--jobs {arguments.jobs}: at least 1")
+    return arguments
+
+
+def _reporter(cells: Sequence[CellFiles]) -> Callable[[int], None]:
+    """Say how far the cells are and how long the rest takes, every half minute and as cells end."""
+    began_s = time.monotonic()
+    before = sum(map(_fraction, cells))
+    shown = {"s": -_REPORT_S, "done": -1}
+
+    def report(at_work: int) -> None:
+        done = sum(files.result() is not None for files in cells)
+        elapsed_s = time.monotonic() - began_s
+        if done == shown["done"] and elapsed_s - shown["s"] < _REPORT_S:
+            return
+        shown.update(s=elapsed_s, done=done)
+        now = sum(map(_fraction, cells))
+        left = time_left(elapsed_s, now - before, len(cells) - now)
+        _LOG.info("%d of %d cells done, %d at work; %s left", done, len(cells), at_work, left)
+
+    return report
+
+
+def _fraction(files: CellFiles) -> float:
+    return files.fraction() if files.result() is None else 1.0
+
+
+def time_left(elapsed_s: float, made: float, rest: float) -> str:
+    """Time for the rest of the cells at the pace so far; "unknown time" before there is any."""
+    if made <= 0:
+        return "unknown time"
+    return str(timedelta(seconds=round(elapsed_s * rest / made)))
