@@ -44,13 +44,14 @@ the file, which beats the default below:
 - `--config` takes a preset's name or a TOML file. A file may begin with `extends = "quick"` (a
   preset or another file) and set only what differs.
 - Values of flags and variables are TOML; anything that is not TOML is read as a string.
-- An unknown name is refused with the nearest known one, an impossible value with the reason.
+- An unknown name is refused with the nearest known one, an impossible value with the reason. So is
+  a variable with an underscore too few, such as `MRCDRL_LEARNER_BATCH_SIZE`. Numbers are finite.
 - `mrcdrl config` takes the same flags and prints the resolved configuration. A run keeps its own in
   `runs/NAME/config.toml`, which `--resume` reads.
 - A process that joins a run takes the run's configuration from the replay service, and applies its
   own flags over it. `[transport]` is the exception: it concerns one process, which takes it from
-  its own environment and flags. Processes that `mrcdrl train` starts use its defaults; replay alone
-  takes the configured values.
+  its own environment and flags, or from a file (`--transport FILE`). Processes that `mrcdrl train`
+  starts take it from the run's file.
 
 *Source* says where a default comes from: *paper* (the publication, docs/paper.md), *ancestor* (the
 pymunk car game that the paper's environment descends from), *Ape-X* or *dueling paper* (those

@@ -8,6 +8,7 @@ from mrcdrl.common.config.load import (
     preset_names,
     resolved_environment,
     validate_config,
+    variable,
 )
 from mrcdrl.common.config.schema import (
     AgentConfig,
@@ -18,6 +19,7 @@ from mrcdrl.common.config.schema import (
     ReplayConfig,
     RunConfig,
     TransportConfig,
+    kept_settings,
     sections,
 )
 from mrcdrl.common.config.toml import to_toml
@@ -33,6 +35,7 @@ __all__ = [
     "RunConfig",
     "TransportConfig",
     "apply_overrides",
+    "kept_settings",
     "load_config",
     "load_transport",
     "preset_names",
@@ -40,4 +43,5 @@ __all__ = [
     "sections",
     "to_toml",
     "validate_config",
+    "variable",
 ]

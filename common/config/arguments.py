@@ -1,17 +1,18 @@
 """Command-line flags from the configuration's schema; an unknown flag gets a suggestion.
 
 Invariants: `--section.field VALUE` exists for every field, with its description; values are
-checked by the schema, not here.
+checked by the schema, not here. A number that a flag of a command takes is checked as it is parsed.
 """
 
 import argparse
 import difflib
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 from mrcdrl.common.config import sections
+from mrcdrl.common.config.schema import LARGEST
 
 _DEST = "config:"
 
@@ -45,6 +46,29 @@ class Parser(argparse.ArgumentParser):
         """Write one line and exit with code 2."""
         sys.stderr.write(f"mrcdrl: {message} (see {self.prog} --help)\n")
         raise SystemExit(2)
+
+
+def whole_number(least: int, most: int = LARGEST) -> Callable[[str], int]:
+    """An argparse type: whole numbers between these, both included."""
+
+    def parsed(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+        if not least <= number <= most:
+            limits = f"at least {least}" if number < least else f"at most {most}"
+            raise argparse.ArgumentTypeError(f"{number} must be {limits}")
+        return number
+
+    return parsed
+
+
+def add_transport_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the flag of a process that has settings of its own in [transport] only."""
+    parser.add_argument(
+        "--transport", metavar="FILE", help="a TOML file whose [transport] this process takes"
+    )
 
 
 def add_config_flags(

@@ -5,6 +5,7 @@ Invariant: an unknown name is refused, and the nearest known one suggested.
 """
 
 import difflib
+import json
 import os
 import re
 import tomllib
@@ -12,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -25,9 +26,9 @@ EXTENDS = "extends"
 _TYPES = {
     "int": "must be a whole number",
     "float": "must be a number",
+    "finite": "must be a finite number",
     "bool": "must be true or false",
     "string": "must be text",
-    "tuple": "must be a list",
 }
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
@@ -54,7 +55,7 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
         text = (resources.files("mrcdrl.configs") / f"{source}.toml").read_text("utf-8")
     else:
         try:
-            text = path.read_text("utf-8")
+            text = path.read_text("utf-8-sig")  # some editors begin a file with a mark
         except (OSError, UnicodeDecodeError) as error:
             presets = ", ".join(preset_names())
             reason = getattr(error, "strerror", None) or str(error)
@@ -95,9 +96,10 @@ def _check_names(table: Mapping[str, Any], where: str) -> None:
 def _parse_value(text: str) -> Any:
     """Parse a value of a flag or variable: as TOML if it is TOML, else as a plain string."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text
+    return table["value"] if len(table) == 1 else text
 
 
 def _merge_text(table: dict[str, Any], dotted: str, text: str, where: str) -> None:
@@ -110,12 +112,38 @@ def _merge_text(table: dict[str, Any], dotted: str, text: str, where: str) -> No
 
 
 def environment_overrides(environ: Mapping[str, str]) -> dict[str, str]:
-    """The environment's settings: MRCDRL_LEARNER__SEED=6 as {"learner.seed": "6"}."""
+    """The environment's settings: MRCDRL_LEARNER__SEED=6 as {"learner.seed": "6"}.
+
+    Raises ConfigError for a variable that looks like a setting with one underscore too few.
+    """
+    named = {key: value for key, value in environ.items() if key.startswith(ENV_PREFIX)}
+    for key in named:
+        if "__" not in key and (meant := _setting_meant(key)):
+            raise ConfigError(f"environment: {key} is not a setting; did you mean {meant}?")
     return {
         key.removeprefix(ENV_PREFIX).lower().replace("__", ".", 1): value
-        for key, value in environ.items()
-        if key.startswith(ENV_PREFIX) and "__" in key
+        for key, value in named.items()
+        if "__" in key
     }
+
+
+def variable(section: str, name: str) -> str:
+    """The environment variable of a setting."""
+    return f"{ENV_PREFIX}{section}__{name}".upper()
+
+
+def _setting_meant(key: str) -> str | None:
+    """The variable that one with single underscores resembles; None if it resembles none of them.
+
+    Others begin with a section too: Kubernetes names the port of a service MRCDRL_REPLAY_PORT.
+    """
+    words = key.removeprefix(ENV_PREFIX).lower()
+    for section, model in sections().items():
+        if words.startswith(f"{section}_"):
+            name = words.removeprefix(f"{section}_")
+            for near in difflib.get_close_matches(name, model.model_fields, n=1, cutoff=0.8):
+                return variable(section, near)
+    return None
 
 
 def resolved_environment() -> dict[str, str]:
@@ -145,13 +173,15 @@ def load_config(
 
 
 def load_transport(
-    overrides: Mapping[str, str], environ: Mapping[str, str] | None = None
+    overrides: Mapping[str, str],
+    environ: Mapping[str, str] | None = None,
+    source: str | None = None,
 ) -> TransportConfig:
     """Load only [transport], which a process needs before it knows the run's other settings.
 
     Arguments and errors are those of `load_config`.
     """
-    table = _overridden({}, overrides, environ)
+    table = _overridden({} if source is None else _read_toml(source), overrides, environ)
     with _one_line("transport"):
         return TransportConfig.model_validate(table.get("transport", {}))
 
@@ -201,17 +231,41 @@ def _one_line(*above: str) -> Iterator[None]:
         raise ConfigError(f"{where}: {_requirement(path, first)}{shown}") from None
 
 
+def _list_form(path: Sequence[str | int], given: Any) -> str:
+    """Say that a list is needed, and how this one is written: of the given text if it is one."""
+    if len(path) > 2:
+        return "must be a list"
+    info = sections()[str(path[0])].model_fields[str(path[1])]
+    if get_args(info.annotation)[0] is str and isinstance(given, str):
+        items = [item.strip(" \"'") for item in given.strip("[] ").split(",")]
+        form = json.dumps(items, ensure_ascii=False)
+        return f"must be a list: {form}, quoted in a shell: '{form}'"
+    return f"must be a list, such as {json.dumps(info.default or _example(info.annotation))}"
+
+
+def _example(annotation: Any) -> Any:
+    """A value of a list setting's type."""
+    inner = [kind for kind in get_args(annotation) if kind is not Ellipsis]
+    return [_example(kind) for kind in inner] if inner else annotation(1)
+
+
 def _requirement(path: Sequence[str | int], error: Mapping[str, Any]) -> str:
     """Describe the values allowed, in our words for the common kinds of error."""
     kind = error["type"].partition("_")[0]
+    if kind == "tuple":
+        return _list_form(path, error.get("input"))
     if kind not in ("greater", "less"):
         message: str = error["msg"].removeprefix("Value error, ")
         return _TYPES.get(kind) or message.replace("Input should be", "must be")
     bounds = sections()[str(path[0])].model_fields[str(path[1])].metadata
     limits = " and ".join(
-        f"{words} {getattr(bound, name):g}"
+        f"{words} {_number(getattr(bound, name))}"
         for bound in bounds
         for name, words in _LIMITS.items()
         if hasattr(bound, name)
     )
     return "must be " + re.sub("at least (.*) and at most", r"between \1 and", limits)
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Self
 
 from mrcdrl.common.config import Config, TransportConfig, apply_overrides, load_transport
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transport_flag, overrides
 from mrcdrl.common.errors import DeadlineError, EndpointError
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import StopSignal
@@ -48,7 +48,7 @@ class Joining:
         host_and_process = f"{socket.gethostname()}-{os.getpid()}"
         worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", host_and_process)
         given = overrides(arguments)
-        transport = load_transport(given)
+        transport = load_transport(given, source=arguments.transport)
         endpoints = arguments.connect or transport.connect
         endpoints = tuple(endpoints or [recorded_endpoint(run_dir, "--connect")])
         transport = transport.model_copy(update={"connect": endpoints, "listen": ()})
@@ -66,6 +66,7 @@ def joining_parser(command: str, description: str) -> Parser:
     parser.add_argument("--connect", action="append", help="endpoint, such as tcp/HOST:7447")
     parser.add_argument("--id", help="this worker's name; default: from the host and process")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
+    add_transport_flag(parser)
     add_config_flags(parser)
     return parser
 

@@ -38,6 +38,7 @@ _LOG = logging.getLogger("transport")
 _RETRY_S = 0.2
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _ENCRYPTED = "tls/"
+_PORT_0 = re.compile(r"[^?#]*:0+(?![^?#])")
 _LOOPBACK = re.compile(r"[a-z]+/(127\.|\[::1\]|localhost:)")
 _CLIENT_SETTINGS: dict[str, Any] = {
     "mode": "client",
@@ -290,6 +291,10 @@ def _check_endpoints(config: TransportConfig, endpoints: tuple[str, ...]) -> Non
     for endpoint in endpoints:
         if not _ENDPOINT.fullmatch(endpoint):
             raise EndpointError(f"{endpoint!r} is not an endpoint; write one as tcp/127.0.0.1:7447")
+        if _PORT_0.match(endpoint):
+            raise EndpointError(
+                f"{endpoint}: port 0 is any free one, which nobody else would know; give a port"
+            )
         if config.key and not endpoint.startswith(_ENCRYPTED):
             raise EndpointError(
                 f"{endpoint} is not encrypted, but transport.certificate is given; "

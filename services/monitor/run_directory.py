@@ -97,6 +97,10 @@ class RunDirectory(Closing):
         return run
 
     @property
+    def config_file(self) -> Path:
+        return self.path / RUN_CONFIG
+
+    @property
     def logs(self) -> Path:
         return self.path / "logs"
 

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from mrcdrl.common.config import load_transport
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transport_flag, overrides
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
 from mrcdrl.common.transport import ROUTER_FILE, AccessLog, Session
@@ -27,9 +27,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--connect", action="append", help="another router's endpoint, linked to once it is up"
     )
+    add_transport_flag(parser)
     add_config_flags(parser, only=("transport",))
     arguments = parser.parse_args(argv)
-    given = load_transport(overrides(arguments))
+    given = load_transport(overrides(arguments), source=arguments.transport)
     transport = given.model_copy(
         update={
             "listen": tuple(arguments.listen or given.listen),

@@ -5,7 +5,7 @@ import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 
-from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError
 
 ROLES = ("router", "replay", "learner", "actor", "evaluator", "status", "robot")
@@ -26,10 +26,10 @@ def main(argv: Sequence[str]) -> int:
         help=f"a name or address of the router besides {', '.join(HOSTS)}",
     )
     parser.add_argument("--role", action="append", help=f"default: {', '.join(ROLES)}")
-    parser.add_argument("--days", type=int, default=365, help="days of validity; default: 365")
+    parser.add_argument(
+        "--days", type=whole_number(1, 36_500), default=365, help="days of validity; default: 365"
+    )
     arguments = parser.parse_args(argv)
-    if arguments.days < 1:
-        parser.error("--days: at least 1")
     if importlib.util.find_spec("cryptography") is None:
         raise ConfigError("needs cryptography, which is not installed: pip install 'mrcdrl[certs]'")
     from mrcdrl.services.tools.certificates import make

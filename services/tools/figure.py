@@ -14,7 +14,7 @@ import numpy as np
 
 from mrcdrl.common.arena import Scene, literal_views, make_codec, render_arena, test_starts
 from mrcdrl.common.config import ArenaConfig
-from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
 from mrcdrl.services.evaluator.trial import EpisodeResult
@@ -48,12 +48,7 @@ _WORLD = (
 
 def main(argv: Sequence[str]) -> int:
     """Write the figure; return the exit code."""
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    if arguments.episodes is not None and arguments.episodes < 1:
-        parser.error(f"--episodes {arguments.episodes}: at least 1")
-    if arguments.frame < 0:
-        parser.error(f"--frame {arguments.frame}: at least 0")
+    arguments = _parser().parse_args(argv)
     check_suffix(arguments.out, SUFFIXES)
     _FIGURES[arguments.figure](arguments)
     return 0
@@ -73,11 +68,13 @@ def _parser() -> Parser:
         help="in addition to weights, or instead of them",
     )
     parser.add_argument(
-        "--episodes", type=int, help="episodes to show; default: 12, or 4 to compare"
+        "--episodes", type=whole_number(1), help="episodes to show; default: 12, or 4 to compare"
     )
-    parser.add_argument("--frame", type=int, default=40, help="frame of the episode, for `views`")
     parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the starts and the exploration"
+        "--frame", type=whole_number(0), default=40, help="frame of the episode, for `views`"
+    )
+    parser.add_argument(
+        "--seed", type=whole_number(0), default=0, help="seed of the starts and the exploration"
     )
     add_arena_flags(parser)
     return parser

@@ -11,7 +11,7 @@ import torch
 from mrcdrl.common.arena import make_codec, test_starts
 from mrcdrl.common.arena.controllers import CONTROLLERS, check_controller, make_controller
 from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.model.policy import Policy
@@ -62,12 +62,13 @@ def subject_parser(command: str, description: str) -> Parser:
 
 def parse_with_episodes(parser: Parser, argv: Sequence[str], num: int) -> argparse.Namespace:
     """Add --episodes, by default `num`, and --seed; parse the flags."""
-    parser.add_argument("--episodes", type=int, default=num, help=f"starts; default: {num}")
-    parser.add_argument("--seed", type=int, default=0, help="of the starts and the exploration")
-    arguments = parser.parse_args(argv)
-    if arguments.episodes < 1:
-        parser.error(f"--episodes {arguments.episodes}: at least 1")
-    return arguments
+    parser.add_argument(
+        "--episodes", type=whole_number(1), default=num, help=f"starts; default: {num}"
+    )
+    parser.add_argument(
+        "--seed", type=whole_number(0), default=0, help="of the starts and the exploration"
+    )
+    return parser.parse_args(argv)
 
 
 def add_arena_flags(parser: Parser) -> None:

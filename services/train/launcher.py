@@ -14,10 +14,9 @@ from mrcdrl.common.arena import test_starts
 from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import ConfigError, EndpointError
-from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import COMMAND, StopSignal, available_cores
-from mrcdrl.common.transport import Session
+from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display
 from mrcdrl.services.monitor.follower import Follower
@@ -73,17 +72,22 @@ def check_possible(config: Config) -> None:
     initial_weights = config.learner.initial_weights
     if initial_weights and not Path(initial_weights).exists():
         raise ConfigError(f"learner.initial_weights {initial_weights}: no such file or directory")
+    if config.transport.connect:
+        raise ConfigError(
+            f"transport.connect {', '.join(config.transport.connect)}: mrcdrl train connects to "
+            "the replay that it starts; leave the setting out, or give it as []"
+        )
     if config.transport.listen:
-        Session(config.transport.model_copy(update={"connect": ()})).close()
+        Session(config.transport).close()
 
 
-def supervise(
-    run: RunDirectory, fleet: Fleet, recorder: Recorder, endpoint: str, stop: StopSignal
-) -> str:
+def supervise(run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSignal) -> str:
     """Run all processes until a signal or the stopping rule ends the run; the reason."""
     config = run.config
     state, rule = RunState(config), StoppingRule(config.run)
-    start_replay(run, fleet, endpoint)
+    endpoints = config.transport.listen or (free_endpoint(),)
+    endpoint = endpoints[0]
+    start_replay(run, fleet, endpoints)
     with join(fleet, config.transport, endpoint) as session:
         run.note_endpoint(endpoint)
         follower = Follower(session, Keys(run.path.name), state, recorder, rule)
@@ -121,13 +125,16 @@ def join(fleet: Fleet, transport: TransportConfig, endpoint: str) -> Session:
                 raise
 
 
-def start_replay(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
+def start_replay(run: RunDirectory, fleet: Fleet, endpoints: Sequence[str]) -> None:
     """Start one replay process that listens itself, or several shards behind a router."""
+    ends = [word for endpoint in endpoints for word in ("--listen", endpoint)]
     num_shards = run.config.replay.shards
     if num_shards > 1:
-        fleet.start("router", "router-0", ["--listen", endpoint])
+        fleet.start("router", "router-0", ["--transport", str(run.config_file), *ends])
+        ends = ["--connect", endpoints[0]]
     for shard in range(num_shards):
-        fleet.start("replay", f"replay-{shard}", replay_arguments(run, endpoint, shard))
+        flags = ["--config", str(run.config_file), "--shard", str(shard), *ends]
+        fleet.start("replay", f"replay-{shard}", [*run_flags(run), *flags])
 
 
 def start_workers(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
@@ -140,26 +147,13 @@ def start_workers(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
     ):
         for index in range(count):
             worker = f"{role}-{index}"
-            fleet.start(role, worker, join_arguments(run, endpoint, worker))
+            flags = ["--transport", str(run.config_file), "--connect", endpoint, "--id", worker]
+            fleet.start(role, worker, [*run_flags(run), *flags])
 
 
-def replay_arguments(run: RunDirectory, endpoint: str, shard: int) -> list[str]:
-    """Flags for a replay process."""
-    end = "--listen" if run.config.replay.shards == 1 else "--connect"
-    return [
-        *("--run", run.path.name, "--run-dir", str(run.path.parent)),
-        *("--config", str(run.path / RUN_CONFIG), "--shard", str(shard), end, endpoint),
-    ]
-
-
-def join_arguments(run: RunDirectory, endpoint: str, worker: str) -> list[str]:
-    """Flags for a process that joins the run."""
-    run_dir = str(run.path.parent)
-    name = run.path.name
-    arguments = ["--run", name, "--connect", endpoint, "--run-dir", run_dir, "--id", worker]
-    for field, value in run.config.transport.model_dump(exclude={"listen", "connect"}).items():
-        arguments += [f"--transport.{field}", str(value).lower()]
-    return arguments
+def run_flags(run: RunDirectory) -> list[str]:
+    """Flags that name the run; its settings are in its file."""
+    return ["--run", run.path.name, "--run-dir", str(run.path.parent)]
 
 
 def expectation(config: Config) -> str:

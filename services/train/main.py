@@ -4,7 +4,6 @@ import logging
 from collections.abc import Sequence
 
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.common.transport import free_endpoint
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.launcher import expectation, open_run, supervise, write_plots
@@ -18,11 +17,10 @@ def main(argv: Sequence[str]) -> int:
         stop = StopSignal().listen()
         prefix = "resuming " if run.resumed else ""
         _LOG.info("%srun %s: %s", prefix, run.path, expectation(run.config))
-        endpoint = (run.config.transport.listen or (free_endpoint(),))[0]
         fleet = Fleet(run.logs)
         try:
             with Recorder(run.path, run.config) as recorder:
-                reason = supervise(run, fleet, recorder, endpoint, stop)
+                reason = supervise(run, fleet, recorder, stop)
         finally:
             fleet.stop()
         _LOG.info("%s; writing plots and video …", reason)

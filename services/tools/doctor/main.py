@@ -47,7 +47,7 @@ def parser() -> Parser:
     made.add_argument("--run-dir", type=Path, default=Path("runs"), help="directory of the runs")
     made.add_argument("--config", help="a preset or a TOML file; default: the run's")
     made.add_argument("--json", action="store_true", help="print the findings as JSON")
-    made.set_defaults(id="doctor")
+    made.set_defaults(id="doctor", transport=None)
     add_config_flags(made)
     return made
 

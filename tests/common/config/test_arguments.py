@@ -3,7 +3,7 @@
 import pytest
 
 from mrcdrl.common.config import load_config, sections
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 
 FIELDS = [(section, name) for section, model in sections().items() for name in model.model_fields]
 
@@ -98,3 +98,22 @@ def test_there_are_no_abbreviations(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_flag_without_its_value_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--agent.gamma: expected one argument" in refused(capsys, "--agent.gamma")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("-1", "-1 must be at least 0"),
+        ("1.5", "'1.5' is not a whole number"),
+        (str(2**63), f"{2**63} must be at most"),
+    ],
+)
+def test_a_number_out_of_range_is_one_line(
+    text: str, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parser = make_parser()
+    parser.add_argument("--seed", type=whole_number(0))
+    assert parser.parse_args(["--seed", "7"]).seed == 7
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--seed", text])
+    assert f"argument --seed: {reason}" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
@@ -164,13 +164,31 @@ IMPOSSIBLE = {
     "value at an open limit": ({"arena.turn_deg": "180"}, "deg: must be above 0 and below 180 "),
     "value without an upper limit": ({"run.actors": "-1"}, "run.actors: must be at least 0 "),
     "no such choice": ({"agent.kind": "duell"}, "agent.kind: must be 'duel', 'ddqn' or 'dqn' "),
-    "not a number": ({"agent.gamma": "nan"}, "agent.gamma: must be above 0 and below 1 .given nan"),
+    "not a number": ({"agent.gamma": "nan"}, "agent.gamma: must be a finite number .given nan"),
+    "a reward beyond float32": (
+        {"arena.success_reward": "1e39"},
+        "must be between -1e.06 and 1e.06",
+    ),
+    "a time beyond the clock": ({"transport.timeout_s": "1e12"}, "above 0 and at most 1e.09"),
+    "two values": ({"agent.gamma": "0.5\n[x]"}, r"must be a number .given '0.5\\n\[x\]'"),
     "half a robot": ({"arena.num_robots": "2.5"}, "must be a whole number .given 2.5"),
     "text for a count": ({"arena.num_robots": "two"}, "must be a whole number .given 'two'"),
     "text for a number": ({"agent.gamma": "high"}, "agent.gamma: must be a number .given 'high'"),
     "text for a switch": ({"learner.symmetries": "no way"}, "must be true or false"),
     "a number for text": ({"learner.device": "3"}, "learner.device: must be text .given 3"),
-    "text for a list": ({"transport.connect": "tcp/a:1"}, "connect: must be a list .given 'tcp"),
+    "text for a list": (
+        {"transport.connect": "tcp/a:1"},
+        r"""must be a list: \["tcp/a:1"\], quoted in a shell: '\["tcp/a:1"\]' .given 'tcp/a""",
+    ),
+    "a list without quotes": (
+        {"transport.listen": "[tcp/a:1, tcp/b:2]"},
+        r'listen: must be a list: \["tcp/a:1", "tcp/b:2"\], quoted',
+    ),
+    "a number for a schedule": (
+        {"exploration.schedule": "0.1"},
+        r"schedule: must be a list, such as \[\[0, 1.0\], \[800000, 0.1\]\] .given 0.1",
+    ),
+    "a number for points": ({"arena.targets_px": "5"}, r"must be a list, such as \[\[1.0, 1.0\]\]"),
     "text in a schedule": (
         {"exploration.schedule": "[[0, 'x']]"},
         r"schedule\.0\.1: must be a number .given 'x'",
@@ -218,6 +236,67 @@ IMPOSSIBLE = {
 def test_the_impossible_is_refused_with_its_consequence(case: str) -> None:
     overrides, reason = IMPOSSIBLE[case]
     assert re.search(reason, refusal(None, overrides))
+
+
+NUMBERS = [
+    (section, name)
+    for section, name in FIELDS
+    if re.search(r"\bfloat\b", str(sections()[section].model_fields[name].annotation))
+]
+SEEDS = [f"{section}.{name}" for section, name in FIELDS if name.endswith("seed")]
+
+
+def filled(annotation: Any, number: float) -> Any:
+    """A value of this type, with the number in each place of a float."""
+    inner = [kind for kind in get_args(annotation) if kind is not Ellipsis]
+    return (
+        [filled(kind, number) for kind in inner]
+        if inner
+        else annotation(annotation is int or number)
+    )
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize(("section", "name"), NUMBERS)
+def test_every_number_is_finite(section: str, name: str, number: str, write: Any) -> None:
+    value = filled(sections()[section].model_fields[name].annotation, float(number))
+    source = write(f"[{section}]\n{name} = {value}\n")
+    assert re.search(rf"^{section}\.{name}[.0-9]*: must be a finite number", refusal(source))
+
+
+@pytest.mark.parametrize("seed", ["-1", str(2**63)])
+@pytest.mark.parametrize("name", SEEDS)
+def test_every_seed_is_one_that_all_generators_take(name: str, seed: str) -> None:
+    assert f"{name}: must be between 0 and {2**63 - 1} (given {seed})" in refusal(
+        None, {name: seed}
+    )
+
+
+@pytest.mark.parametrize(("section", "name"), FIELDS)
+def test_a_setting_with_an_underscore_too_few_is_reported(section: str, name: str) -> None:
+    line = refusal(None, None, {f"MRCDRL_{section}_{name}".upper(): "1"})
+    assert f"did you mean MRCDRL_{section.upper()}__{name.upper()}?" in line
+
+
+@pytest.mark.parametrize(
+    "variable",
+    [
+        "MRCDRL_HEARTBEAT",
+        "MRCDRL_DIE_WITH_PARENT",
+        "MRCDRL_RUN_DIR",
+        "MRCDRL_REPLAY_PORT",
+        "MRCDRL_REPLAY_PORT_7447_TCP",
+        "MRCDRL_REPLAY_SERVICE_HOST",
+        "MRCDRL_DOCKER_ENGINE",
+    ],
+)
+def test_a_variable_that_is_no_setting_is_left_alone(variable: str) -> None:
+    assert load(None, None, {variable: "1"}) == Config()
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "mark.toml").write_text("[learner]\nseed = 5\n", "utf-8-sig")
+    assert load(str(tmp_path / "mark.toml")).learner.seed == 5
 
 
 def test_overrides_of_a_configuration_are_checked_as_a_whole() -> None:
@@ -338,8 +417,14 @@ def test_the_way_to_a_run_is_known_before_its_other_settings() -> None:
         load_config(None, given, environ={})
 
 
+def test_the_way_to_a_run_may_stand_in_a_file(write: Any) -> None:
+    source = write("[transport]\ntimeout_s = 7\nmax_message_bytes = 9\n[learner]\nseed = 1\n")
+    transport = load_transport({"transport.timeout_s": "8"}, environ={}, source=source)
+    assert (transport.timeout_s, transport.max_message_bytes) == (8, 9)
+
+
 def test_a_wrong_way_to_a_run_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"transport\.timeout_s: must be above 0 .given -1"):
+    with pytest.raises(ConfigError, match=r"transport\.timeout_s: must be above 0 and .*given -1"):
         load_transport({"transport.timeout_s": "-1"}, environ={})
 
 

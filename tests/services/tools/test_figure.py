@@ -175,8 +175,8 @@ def test_policies_of_different_arenas_are_not_compared(tmp_path: Path, run_dir: 
     [
         (["arena"], "--out"),
         (["map", "--out", "a.png"], "invalid choice: 'map'"),
-        (["arena", "--out", "a.png", "--episodes", "0"], "--episodes 0: at least 1"),
-        (["arena", "--out", "a.png", "--frame", "-1"], "--frame -1: at least 0"),
+        (["arena", "--out", "a.png", "--episodes", "0"], "--episodes: 0 must be at least 1"),
+        (["arena", "--out", "a.png", "--frame", "-1"], "--frame: -1 must be at least 0"),
     ],
 )
 def test_wrong_flags_are_refused(
