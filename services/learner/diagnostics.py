@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mrcdrl.common.config import Config
+from mrcdrl.common.config.returns import largest_return
 from mrcdrl.common.messages.metrics import NUM_BINS, Bins, DiagnosticMetrics
 from mrcdrl.common.messages.trajectory import Float32Array
 from mrcdrl.common.model.fast_forward import Trace, fast_forward, operands, prepare
@@ -140,15 +141,3 @@ class Histogram:
         shares = self._counts / max(self._counts.sum(), 1.0)
         self._counts[:] = 0
         return tuple(float(share) for share in shares)
-
-
-def largest_return(config: Config) -> float:
-    """A bound on the value of any state, in scaled rewards: all that an episode may bring."""
-    arena, gamma = config.arena, config.agent.gamma
-    steps = min(arena.max_frames, 1 / (1 - gamma))
-    rewards = (
-        abs(arena.success_reward)
-        + arena.max_collisions * abs(arena.collision_reward)
-        + steps * abs(arena.step_reward)
-    )
-    return config.agent.reward_scale * rewards

@@ -6,6 +6,7 @@ apart until the same robot's next chunk arrives, which begins with them; its row
 chunks, as it outlives the earlier one. Pure: no clock, lock or transport.
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Self
@@ -13,10 +14,13 @@ from typing import Self
 import numpy as np
 
 from mrcdrl.common.config import Config
+from mrcdrl.common.config.returns import largest_n_step_return, largest_return
 from mrcdrl.common.errors import ConfigError, WireError
 from mrcdrl.common.messages.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
 from mrcdrl.services.replay.capacity import TAILS_PER_CHUNK, capacity_of
 from mrcdrl.services.replay.sampler import Sampler, make_sampler
+
+_LARGEST_ERRORS = 10.0  # largest returns; greater TD errors say only that values have diverged
 
 
 @dataclass(slots=True)
@@ -37,8 +41,9 @@ class Table:
     capacity: transitions. stack: records in a state. n_step: longest return; a transition's
     window is stack + n_step records. chunk_length: transitions in most chunks; with many chunks
     that are shorter, or that no later chunk continues, the table holds less than its capacity.
-    record_bytes: length of one record. sampler: of the same capacity, for this table alone. All
-    memory is allocated, and touched, at once.
+    record_bytes: length of one record. sampler: of the same capacity, for this table alone.
+    largest_return: a chunk with a greater n-step return is refused. largest_error: greater absolute
+    TD errors count as this one. All memory is allocated, and touched, at once.
     """
 
     def __init__(
@@ -49,6 +54,9 @@ class Table:
         chunk_length: int,
         record_bytes: int,
         sampler: Sampler,
+        *,
+        largest_return: float = math.inf,
+        largest_error: float = math.inf,
     ) -> None:
         window = stack + n_step
         overlap = window - 1
@@ -82,6 +90,8 @@ class Table:
         self._next_key = 0
         self._next_row = 0
         self._sampler = sampler
+        self._largest_return = largest_return
+        self._largest_error = np.float32(largest_error)
 
     @classmethod
     def from_config(cls, config: Config, *, record_bytes: int | None = None) -> Self:
@@ -99,6 +109,8 @@ class Table:
             chunk_length=1 if config.run.turn_size else config.actor.chunk_length,
             record_bytes=config.arena.record_bytes if record_bytes is None else record_bytes,
             sampler=make_sampler(config.replay, capacity),
+            largest_return=largest_n_step_return(config),
+            largest_error=_LARGEST_ERRORS * largest_return(config),
         )
 
     def __len__(self) -> int:
@@ -165,6 +177,12 @@ class Table:
             )
         if int(chunk.bootstrap_offsets.max()) > self._n_step:
             raise WireError(f"a bootstrap offset exceeds agent.n_step, {self._n_step}")
+        largest = float(np.abs(chunk.rewards).max())
+        if largest > self._largest_return:
+            raise WireError(
+                f"a return of {largest:g} where no arena of this run gives more than "
+                f"{self._largest_return:g}: other rewards?"
+            )
         if len(chunk) > self._capacity:
             raise WireError(f"{len(chunk)} transitions exceed the capacity {self._capacity}")
 
@@ -196,7 +214,9 @@ class Table:
         self._extents.append(extent)
         self._next_key += length
         self._next_row = first_row + num_rows
-        self._sampler.insert(range(self._next_key - length, self._next_key), chunk.priorities)
+        self._sampler.insert(
+            range(self._next_key - length, self._next_key), self._bounded(chunk.priorities)
+        )
 
     def update_priorities(self, keys: Int64Array, priorities: Float32Array) -> int:
         """Set transitions' absolute TD errors, both [N]; return how many were used.
@@ -204,7 +224,11 @@ class Table:
         Evicted transitions are ignored; with uniform sampling, all are.
         """
         present = (keys >= self.first_key) & (keys < self._next_key)
-        return self._sampler.update(keys[present], priorities[present])
+        return self._sampler.update(keys[present], self._bounded(priorities[present]))
+
+    def _bounded(self, priorities: Float32Array) -> Float32Array:
+        """Absolute TD errors, the greatest of which cannot take over the sampling."""
+        return np.minimum(priorities, self._largest_error)
 
     def sample_bytes(self, size: int) -> int:
         """Bytes of the records of `size` transitions."""

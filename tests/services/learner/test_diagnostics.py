@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.config.returns import largest_return
 from mrcdrl.common.errors import DivergedError
 from mrcdrl.common.messages.metrics import numbers
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.batch import Batch
-from mrcdrl.services.learner.diagnostics import Diagnostics, largest_return
+from mrcdrl.services.learner.diagnostics import Diagnostics
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.training_loop import run
 from mrcdrl.services.learner.weights_publisher import WeightsPublisher
@@ -107,13 +108,6 @@ def test_values_no_episode_can_bring_are_told_until_they_are_gone(
             diagnostics.look(batch, update)
     assert len(caplog.messages) == 2
     assert f"no return exceeds {bound:.3g}" in caplog.text
-
-
-def test_the_largest_return_is_that_of_the_rewards() -> None:
-    rewards = {"arena.success_reward": "100", "arena.collision_reward": "-2"}
-    more = {"arena.step_reward": "0.5", "arena.max_collisions": "3", "agent.reward_scale": "0.1"}
-    config = load_config(None, rewards | more | {"agent.gamma": "0.9"}, environ={})
-    assert largest_return(config) == pytest.approx(0.1 * (100 + 3 * 2 + 0.5 * 10))
 
 
 class Prefetched:

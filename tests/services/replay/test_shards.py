@@ -131,8 +131,8 @@ def test_batches_come_in_proportion_to_the_shards_priorities(router: str, sessio
 def test_priorities_reach_the_shard_that_their_keys_name(router: str, session: Session) -> None:
     config = config_of(2)
     with shard_up(config, router, 0) as first, shard_up(config, router, 1) as second:
-        fill(session, config, 0, 40, priority=1.0)
-        fill(session, config, 1, 40, priority=1.0)
+        fill(session, config, 0, 40, priority=0.0)
+        fill(session, config, 1, 40, priority=0.0)
         writer = PriorityWriter(session, KEYS, StopSignal(), num_shards=2)
         keys = np.array([2 * 5, 2 * 6, 2 * 7 + 1, 2 * 999 + 1], np.int64)
         reply = writer.update(Priorities(keys, np.full(4, 1e6, np.float32)))

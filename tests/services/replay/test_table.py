@@ -19,10 +19,13 @@ from hypothesis.stateful import (
     rule,
 )
 
+from mrcdrl.common.config import load_config
+from mrcdrl.common.config.returns import largest_n_step_return, largest_return
 from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.trajectory import Chunk, Float64Array, Int64Array, UInt8Array
 from mrcdrl.services.replay.sampler import PrioritizedSampler, UniformSampler
 from mrcdrl.services.replay.table import Table
+from tests.services.replay import harness
 
 RECORD_BYTES = 4
 EXPONENT = 0.6
@@ -308,3 +311,37 @@ def test_memory_is_the_rows_and_the_columns() -> None:
     assert table.capacity == 1000
     prioritized = Table(1000, 4, 1, 50, 80, PrioritizedSampler(1000, EXPONENT, rng))
     assert prioritized.nbytes == table.nbytes + 2 * 1024 * 8
+
+
+def test_a_return_that_no_arena_gives_is_refused() -> None:
+    config = load_config("smoke", {"arena.success_reward": "10"}, environ={})
+    table, chunk = Table.from_config(config), harness.make_chunk(5)
+    table.insert(chunk)
+    most = largest_n_step_return(config)
+    for odd in (1e38, -1e38, most + 1):
+        rewards = chunk.rewards.copy()
+        rewards[-1] = odd
+        with pytest.raises(
+            WireError, match=r"a return of .* where no arena .* more than 28: other"
+        ):
+            table.insert(dataclasses.replace(chunk, rewards=rewards))
+    rewards = np.full(len(chunk), -most, np.float32)
+    table.insert(dataclasses.replace(chunk, rewards=rewards))
+    assert len(table) == 2 * len(chunk)
+
+
+def test_one_priority_cannot_take_over_the_sampling() -> None:
+    """Whether it comes with a chunk or as an update; sane ones are taken as they are."""
+    config = load_config("smoke", {"replay.sampler": "prioritized"}, environ={})
+    table, exponent = Table.from_config(config), config.replay.priority_exponent
+    sane = largest_return(config)
+    for number, priority in enumerate((sane, 1e38)):
+        table.insert(harness.make_chunk(number, priority=priority))
+    length = len(table) // 2
+    expected = np.array([sane, 10 * sane]).repeat(length)
+    found = table.sampler.scaled_priorities(table.keys)
+    assert found == pytest.approx(expected**exponent, rel=1e-5)
+    assert table.sampler.largest == pytest.approx(10 * sane)
+    table.update_priorities(np.array([0, 1]), np.array([3e38, sane / 2], np.float32))
+    found = table.sampler.scaled_priorities(table.keys)
+    assert found[:2] == pytest.approx(np.array([10 * sane, sane / 2]) ** exponent, rel=1e-5)
