@@ -9,14 +9,14 @@ import numpy as np
 import torch
 
 from mrcdrl.common.arena import make_arenas, make_codec
-from mrcdrl.common.config import Config
+from mrcdrl.common.config import Config, validate_config
 from mrcdrl.common.model.fast_forward import fast_forward, operands, prepare
 from mrcdrl.common.model.q_network import QNetwork
 
 
 def main() -> None:
     """Step and render a new episode as actors do; compute values of states and their gradient."""
-    config = Config()
+    config = validate_config(Config().model_dump())  # as received: floats, not a default's ints
     arena = config.arena
     arenas = make_arenas(arena, [np.random.default_rng(0)], [0])
     codec = make_codec(arena)
