@@ -350,7 +350,8 @@ class LearnerConfig(Section):
     """Updates in one launch of a graph, if as many batches are ready and none of target_period,
     publish_period and run.learner_steps falls between them. (ours)"""
     threads: Annotated[int, Field(ge=0)] = 0
-    """Threads that share a batch on a CPU; 0: half the cores, at least 1. (ours)"""
+    """Threads that share a batch on a CPU; 0: as many as prove fastest while it runs, up to one a
+    core; with run.turn_size half the cores. (ours)"""
     drawing_threads: Annotated[int, Field(ge=0)] = 0
     """Threads that render a large batch, where the CPU renders; 0: one a core. (ours)"""
     prefetch_batches: Count = 8

@@ -21,6 +21,7 @@ from mrcdrl.common.model.q_network import QNetwork, precision, resolve_device
 from mrcdrl.common.model.weights_io import SENT_AS, load_weights, read_arrays, weights_to_bytes
 from mrcdrl.services.learner.accelerate.cuda_graphs import Capturer, capturer_for
 from mrcdrl.services.learner.accelerate.step import AcceleratedStep
+from mrcdrl.services.learner.accelerate.thread_tuner import ThreadTuner
 from mrcdrl.services.learner.average import ParameterAverage
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.step import MOMENTS, GradientStep, Update
@@ -49,10 +50,11 @@ class Learner:
         stack: int,
         view_px: int,
         threads: int = 1,
+        tuner: ThreadTuner | None = None,
         capturer: Capturer | None = None,
     ) -> None:
-        """threads: share a batch on a CPU, each one of torch's. capturer: of steps, instead of the
-        device's own.
+        """threads: share a batch on a CPU, each one of torch's. tuner: chooses how many of them do.
+        capturer: of steps, instead of the device's own.
 
         Raises ConfigError for an unknown device, or one that cannot do what learner.step says.
         """
@@ -71,22 +73,24 @@ class Learner:
         self.target.load_state_dict(self.online.state_dict())
         decay = learner.average_decay
         self._average = ParameterAverage(self.online, decay) if decay else None
+        on_cpu = self.device.type == "cpu"
         self._step: GradientStep = AcceleratedStep(
             self.online,
             self.target,
             agent,
-            num_threads=threads if self.device.type == "cpu" else 1,
+            num_threads=threads if on_cpu else 1,
+            tuner=tuner if on_cpu else None,
             capturer=capturer or capturer_for(learner.step, self.device),
             updates_per_launch=learner.updates_per_launch,
         )
 
     @classmethod
-    def from_config(cls, config: Config, threads: int = 1) -> Self:
-        """The learner of a run."""
-        arena = config.arena
-        return cls(
-            config.agent, config.learner, stack=arena.stack, view_px=arena.view_px, threads=threads
-        )
+    def from_config(
+        cls, config: Config, threads: int = 1, tuner: ThreadTuner | None = None
+    ) -> Self:
+        """The learner of a run; threads and tuner as in the constructor."""
+        shape = {"stack": config.arena.stack, "view_px": config.arena.view_px}
+        return cls(config.agent, config.learner, **shape, threads=threads, tuner=tuner)
 
     def __repr__(self) -> str:
         return (

@@ -7,12 +7,14 @@ from contextlib import ExitStack
 
 import torch
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal, available_cores
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.common.transport import Session
+from mrcdrl.services.learner.accelerate.thread_tuner import ThreadTuner, thread_counts
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.prefetch import Prefetcher, make_collate
 from mrcdrl.services.learner.priorities import PrioritiesSender
@@ -35,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
         config = fetch_config(session, joining, stop)
         settings, lockstep = config.learner, Lockstep.from_config(config)
         torch.set_num_threads(1)  # threads share batches, not operations
-        learner = Learner.from_config(config, settings.threads or max(1, available_cores() // 2))
+        learner = make_learner(config)
         torch.backends.cudnn.benchmark = True  # batches are of one size
         exact = lockstep is not None and learner.device.type == "cpu"
         torch.use_deterministic_algorithms(exact)
@@ -62,3 +64,14 @@ def main(argv: Sequence[str]) -> int:
         _LOG.info("%s", learner)
         run(config, learner, prefetcher, priorities, publisher, reporter, stop)
     return 0
+
+
+def make_learner(config: Config) -> Learner:
+    """The learner of a run, with as many threads as it says, or as prove fastest.
+
+    In lockstep the same number of threads gives the same numbers, so it is not left to a measure.
+    """
+    cores = available_cores()
+    if config.learner.threads or config.run.turn_size or cores == 1:
+        return Learner.from_config(config, config.learner.threads or max(1, cores // 2))
+    return Learner.from_config(config, cores, ThreadTuner(thread_counts(cores)))

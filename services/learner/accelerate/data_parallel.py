@@ -20,6 +20,8 @@ class DataParallel:
 
     def __init__(self, num_threads: int) -> None:
         self.num_threads = num_threads
+        self.active = num_threads
+        """Threads that work now: 1 ... num_threads."""
         self._pool = (
             ThreadPoolExecutor(num_threads - 1, "slice", partial(torch.set_num_threads, 1))
             if num_threads > 1
@@ -28,9 +30,9 @@ class DataParallel:
 
     def map(self, work: Callable[[slice], T], size: int) -> list[T]:
         """The results of the work on each slice of `size` rows; raises what the work raises."""
-        num = min(self.num_threads, size)
+        num = min(self.active, size)
         first, *others = (slice(i * size // num, (i + 1) * size // num) for i in range(num))
-        if self._pool is None:
+        if self._pool is None or not others:
             return [work(first)]
         begun = [self._pool.submit(work, other) for other in others]
         return [work(first), *(future.result() for future in begun)]

@@ -5,6 +5,7 @@ within rounding, whatever the number of threads; a captured step gives the numbe
 to the bit; nothing waits for the device.
 """
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,6 +30,7 @@ from mrcdrl.services.learner.accelerate.optimizer import (
     gradients,
     leaves,
 )
+from mrcdrl.services.learner.accelerate.thread_tuner import ThreadTuner
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.loss import TDLoss, td_loss
 from mrcdrl.services.learner.step import Update
@@ -53,16 +55,20 @@ class AcceleratedStep:
         agent: AgentConfig,
         *,
         num_threads: int = 1,
+        tuner: ThreadTuner | None = None,
         capturer: Capturer | None = None,
         updates_per_launch: int = 1,
     ) -> None:
-        """num_threads: share a batch. capturer: None where steps are eager.
+        """num_threads: share a batch. tuner: chooses how many of them do; None: all of them.
+
+        capturer: None where steps are eager.
 
         updates_per_launch: steps that one captured launch makes.
         """
         device = next(online.parameters()).device
         self._online, self._target, self._agent = online, target, agent
         self._threads = DataParallel(num_threads)
+        self._tuner = tuner
         self._target_operands = {n: x.detach().clone() for n, x in operands(target).items()}
         self._learning_rate = torch.zeros((), device=device)  # where a captured step reads it
         self._optimizer = SharedOptimizer(online, agent, self._learning_rate, self._threads)
@@ -85,7 +91,13 @@ class AcceleratedStep:
 
     def _eager(self, batch: Batch, learning_rate: float) -> Update:
         self._learning_rate.fill_(learning_rate)
-        return self._update(batch)
+        if self._tuner is None:
+            return self._update(batch)
+        self._threads.active = self._tuner.count
+        started = time.perf_counter()
+        update = self._update(batch)
+        self._tuner.took(time.perf_counter() - started)
+        return update
 
     def _update(self, batch: Batch) -> Update:
         """One step on the device; it neither waits for the device nor counts in Python."""
