@@ -14,7 +14,14 @@ from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from mrcdrl.common.config import Config, load_config, preset_names, sections, to_toml
+from mrcdrl.common.config import (
+    Config,
+    kept_settings,
+    load_config,
+    preset_names,
+    sections,
+    to_toml,
+)
 from mrcdrl.services.tools.simulate import scaling
 from mrcdrl.services.tools.simulate.scaling import Pace
 
@@ -52,6 +59,8 @@ the file, which beats the default below:
   own flags over it. `[transport]` is the exception: it concerns one process, which takes it from
   its own environment and flags, or from a file (`--transport FILE`). Processes that `mrcdrl train`
   starts take it from the run's file.
+- A run that is resumed keeps the settings that its weights and transitions need: {kept}. In
+  lockstep (`run.turn_size`) it also keeps {kept_in_lockstep}. All others may change.
 
 *Source* says where a default comes from: *paper* (the publication, docs/paper.md), *ancestor* (the
 pymunk car game that the paper's environment descends from), *Ape-X* or *dueling paper* (those
@@ -63,7 +72,7 @@ def render() -> str:
     """The whole page."""
     defaults = tomllib.loads(to_toml(Config()))
     shown = _shown(to_toml(Config()))
-    parts = [_HEAD]
+    parts = [_head_page()]
     for section, model in sections().items():
         title = re.sub(r"\s+", " ", model.__doc__ or "").strip()
         parts.append(f"\n## [{section}]\n\n{title}\n\n")
@@ -74,6 +83,17 @@ def render() -> str:
             parts.append("| " + " | ".join(cells) + " |\n")
     parts.append(_presets(defaults))
     return "".join(parts)
+
+
+def _head_page() -> str:
+    always = list(kept_settings(lockstep=False))
+    turns = [setting for setting in kept_settings(lockstep=True) if setting not in always]
+    whole = [f"all of `[{name}]`" for name, model in sections().items() if model.kept]
+    single = [f"`{s}.{n}`" for s, n in always if not sections()[s].kept]
+    return _HEAD.format(
+        kept=", ".join([*whole, *single]),
+        kept_in_lockstep=", ".join(f"`{section}.{name}`" for section, name in turns),
+    )
 
 
 def described(name: str, info: FieldInfo) -> tuple[str, str]:

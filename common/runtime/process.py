@@ -101,9 +101,9 @@ def start_service(
         )
 
 
-def last_line(log: Path) -> str:
-    """The last line of a log, usually the reason why its service ended."""
-    lines = log.read_text("utf-8", "replace").strip().splitlines()
+def last_line(log: Path, begin: int = 0) -> str:
+    """The last line of a log from this byte on, usually the reason why its service ended."""
+    lines = log.read_bytes()[begin:].decode("utf-8", "replace").strip().splitlines()
     return lines[-1] if lines else "its log is empty"
 
 

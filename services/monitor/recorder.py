@@ -71,27 +71,8 @@ class Recorder(Closing):
         return f"Recorder({str(self.run_dir)!r}, closed={self._metrics.closed})"
 
     def restore(self, state: RunState, rule: StoppingRule) -> float:
-        """Fold earlier records into the state and the rule; return the seconds the run lasted.
-
-        Raises RunDirectoryError when a file was written by another version.
-        """
-        metrics = read_last_metrics(self.run_dir)
-        time_s = float(metrics.get("time_s", 0.0))
-        for episode in read_episodes(self.run_dir):
-            state.observe_episode(episode.episode)
-            rule.observe_episode(episode.episode)
-            time_s = max(time_s, episode.time_s)
-        for evaluation in read_evaluations(self.run_dir):
-            state.evaluations.append(evaluation)
-            rule.observe_evaluation(evaluation.evaluation)
-            time_s = max(time_s, evaluation.time_s)
-        state.restore_counted(
-            env_steps=metrics.get("env_steps", 0),
-            robot_steps=metrics.get("robot_steps", 0),
-            learner_steps=metrics.get("learner_steps", 0),
-            by_actor=_counted(metrics),
-        )
-        return time_s
+        """Fold earlier records into the state and the rule; see `restore`."""
+        return restore(self.run_dir, state, rule)
 
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
         """Write an episode that `state` has observed."""
@@ -157,6 +138,25 @@ class Recorder(Closing):
     def _event(self, tag: str, value: float, step: int) -> None:
         if self._events is not None and math.isfinite(value):
             self._events.add_scalar(tag, value, step)
+
+
+def restore(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
+    """Fold the records of a run into the state and the rule; return the seconds the run lasted.
+
+    Raises RunDirectoryError when a file was written by another version.
+    """
+    metrics = read_last_metrics(run_dir)
+    time_s = float(metrics.get("time_s", 0.0))
+    for episode in read_episodes(run_dir):
+        state.observe_episode(episode.episode)
+        rule.observe_episode(episode.episode)
+        time_s = max(time_s, episode.time_s)
+    for evaluation in read_evaluations(run_dir):
+        state.evaluations.append(evaluation)
+        rule.observe_evaluation(evaluation.evaluation)
+        time_s = max(time_s, evaluation.time_s)
+    state.restore_counted(metrics, _counted(metrics))
+    return time_s
 
 
 def _open_events(directory: Path) -> Any:

@@ -11,22 +11,35 @@ import fcntl
 import os
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from mrcdrl.common.config import Config, load_config, to_toml
+from mrcdrl.common.config import Config, kept_settings, load_config, to_toml, variable
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, reason
 from mrcdrl.common.sync.joining import ENDPOINT_FILE
 
-_KEPT = ("arena.", "agent.kind", "replay.shards")  # settings that checkpoints and logs depend on
+Check = Callable[[Config, Config], None]  # of what a run was made with, and is resumed with
 
 
 def default_name(config_name: str, num_robots: int) -> str:
     """A name such as quick-2robots-20261122-101500."""
     stem = Path(config_name).stem
     return f"{stem}-{num_robots}robots-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def refuse_changes(path: Path, before: Config, now: Config) -> None:
+    """Raise RunDirectoryError if a setting differs that the run's weights or records depend on."""
+    lockstep = bool(before.run.turn_size)
+    for section, name in kept_settings(lockstep=lockstep):
+        old, new = (getattr(getattr(config, section), name) for config in (before, now))
+        if old != new:
+            raise RunDirectoryError(
+                f"{section}.{name} is {new} here and {old} in {path}, whose weights or transitions "
+                f"need it; leave out its flag or {variable(section, name)}, or start a new run"
+            )
 
 
 class RunDirectory(Closing):
@@ -65,17 +78,33 @@ class RunDirectory(Closing):
             raise
 
     @classmethod
-    def resume(cls, path: Path, overrides: dict[str, str]) -> Self:
-        """Open an existing run, with its configuration and the flags' changes to it."""
-        if not (path / RUN_CONFIG).is_file():
+    def create_free(cls, path: Path, config: Config) -> Self:
+        """Create it under this name, or the first of name-2, name-3 … that no directory has."""
+        free, number = path, 1
+        while True:
+            try:
+                return cls.create(free, config)
+            except RunDirectoryError as error:
+                if not isinstance(error.__cause__, FileExistsError):
+                    raise
+            number += 1
+            free = path.with_name(f"{path.name}-{number}")
+
+    @classmethod
+    def resume(
+        cls, path: Path, overrides: dict[str, str], check: Check = lambda _before, _now: None
+    ) -> Self:
+        """Open an existing run, with its configuration and the changes of environment and flags.
+
+        check: called before anything is written; what it raises leaves the run as it was.
+        """
+        file = path / RUN_CONFIG
+        if not file.is_file():
             raise RunDirectoryError(f"{path} is not a run ({RUN_CONFIG} is missing)")
-        for name in overrides:
-            if name.startswith(_KEPT):
-                raise RunDirectoryError(
-                    f"{name} cannot be changed: the records in {path} depend on it; start a new run"
-                )
-        config = load_config(str(path / RUN_CONFIG), overrides)
-        return cls._opened(path, config, resumed=True)
+        before = load_config(str(file), environ={})
+        config = load_config(str(file), overrides)
+        refuse_changes(path, before, config)
+        return cls._opened(path, config, resumed=True, check=lambda: check(before, config))
 
     @classmethod
     def join(cls, path: Path, config: Config) -> Self:
@@ -87,11 +116,18 @@ class RunDirectory(Closing):
         return cls._opened(path, config, resumed=True)
 
     @classmethod
-    def _opened(cls, path: Path, config: Config, *, resumed: bool) -> Self:
+    def _opened(
+        cls, path: Path, config: Config, *, resumed: bool, check: Callable[[], None] = lambda: None
+    ) -> Self:
         try:
             run = cls(path, config, resumed=resumed)
-            run.logs.mkdir(exist_ok=True)
-            atomic_write(path / RUN_CONFIG, to_toml(config).encode())
+            try:
+                check()
+                run.logs.mkdir(exist_ok=True)
+                atomic_write(run.config_file, to_toml(config).encode())
+            except BaseException:
+                os.close(run._lock)
+                raise
         except OSError as error:
             raise RunDirectoryError(f"cannot write {path}: {reason(error)}") from error
         return run

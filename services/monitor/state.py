@@ -83,7 +83,7 @@ class RunState:
         self._services: dict[tuple[str, str], Service] = {}
         self._collected = {"env_steps": 0.0, "robot_steps": 0.0}
         self._counted: dict[tuple[str, str], float] = {}  # by an earlier recorder
-        self._learner_steps_before = 0  # until the learner reports again
+        self._before: Mapping[str, float] = {}  # counters, until their services report again
 
     def __repr__(self) -> str:
         return (
@@ -142,19 +142,18 @@ class RunState:
 
     def restore_counted(
         self,
-        env_steps: float,
-        robot_steps: float,
-        learner_steps: float,
+        counted: Mapping[str, float],
         by_actor: Mapping[tuple[str, str], float] = MappingProxyType({}),
     ) -> None:
-        """Add what the run's actors collected before; the learner's counter continues by itself.
+        """Add what the run's actors collected before; other services continue their counters.
 
-        by_actor: the part counted by actors that may still be up, by actor and counter.
+        counted: the run's counters, as metrics. by_actor: the part counted by actors that may
+        still be up, by actor and counter.
         """
         self._counted.update(by_actor)
-        self._collected["env_steps"] += env_steps
-        self._collected["robot_steps"] += robot_steps
-        self._learner_steps_before = int(learner_steps)
+        for name in self._collected:
+            self._collected[name] += counted.get(name, 0)
+        self._before = counted
 
     def _service(self, role: str, service_id: str) -> Service:
         return self._services.setdefault((role, service_id), Service(role, service_id))
@@ -195,11 +194,11 @@ class RunState:
 
     @property
     def learner_steps(self) -> int:
-        return int(self._known("learner", "learner_steps")) or self._learner_steps_before
+        return self._continued("learner", "learner_steps")
 
     @property
     def weights_version(self) -> int:
-        return int(self._known("learner", "weights_version"))
+        return self._continued("learner", "weights_version")
 
     @property
     def published(self) -> tuple[float, int]:
@@ -208,11 +207,15 @@ class RunState:
 
     @property
     def inserts(self) -> int:
-        return int(self._known("replay", "inserts"))
+        return self._continued("replay", "inserts")
 
     @property
     def samples(self) -> int:
-        return int(self._known("replay", "samples"))
+        return self._continued("replay", "samples")
+
+    def _continued(self, role: str, name: str) -> int:
+        """A counter that a service continues; before it reports, as it was in the records."""
+        return int(self._known(role, name) or self._before.get(name, 0))
 
     def per_second(self, name: str, now: float) -> float:
         """Rate of one of COUNTERS over the last seconds, summed over all services."""

@@ -27,6 +27,13 @@ class StoppingRule:
         self._maximum = -1
         self._maximum_at = 0
         self._reached: Evaluation | None = None
+        self._goes_on = False  # although the target was reached
+
+    def go_on(self) -> None:
+        """What was reached so far ends the run no more: patience counts from here."""
+        self._goes_on = self._reached is not None
+        if self._patience_is_over:
+            self._maximum_at = self._episodes
 
     def observe_episode(self, episode: EpisodeSummary) -> None:
         self._episodes += 1
@@ -50,23 +57,33 @@ class StoppingRule:
         is no evaluation of this run's, or not yet.
         """
         run = self._run
-        if self._reached is not None and _order(self._reached) <= published:
+        reached = None if self._goes_on else self._reached
+        if reached is not None and _order(reached) <= published:
             return (
-                f"evaluation success {self._reached.success_rate:.3f} reached "
+                f"evaluation success {reached.success_rate:.3f} reached "
                 f"run.target_success_rate {run.target_success_rate:g}"
             )
         if run.learner_steps and learner_steps >= run.learner_steps:
             return f"learner step limit reached ({run.learner_steps})"
         if run.minutes and minutes >= run.minutes:
             return f"time limit reached ({run.minutes:g} min)"
-        since = self._episodes - self._maximum_at
-        satisfied = self._maximum >= run.patience_floor * SUCCESS_WINDOW
-        if run.patience_episodes and satisfied and since >= run.patience_episodes:
+        if self._patience_is_over:
             return (
                 f"no new maximum above {self._maximum} successes of 100 episodes "
-                f"in {since} episodes (run.patience_episodes)"
+                f"in {self._without_maximum} episodes (run.patience_episodes)"
             )
         return None
+
+    @property
+    def _without_maximum(self) -> int:
+        """Episodes since the last new maximum."""
+        return self._episodes - self._maximum_at
+
+    @property
+    def _patience_is_over(self) -> bool:
+        patience = self._run.patience_episodes
+        satisfied = self._maximum >= self._run.patience_floor * SUCCESS_WINDOW
+        return bool(patience) and satisfied and self._without_maximum >= patience
 
 
 def _order(evaluation: Evaluation) -> tuple[float, int]:

@@ -35,15 +35,17 @@ class ManagedProcess:
     popen: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
     restarts: int = 0
+    log_begin: int = 0  # bytes of the log that earlier processes have written
     log_read: int = 0  # bytes of the log searched for warnings
 
     def start(self) -> None:
+        self.log_begin = self.log_path.stat().st_size if self.log_path.exists() else 0
         environment = {**ALLOCATOR, **resolved_environment()}
         self.popen = start_service(self.role, self.arguments, self.log_path, environment)
         self.started_s = time.monotonic()
 
     def last_line(self) -> str:
-        return last_line(self.log_path)
+        return last_line(self.log_path, self.log_begin)
 
 
 class Fleet:
@@ -55,10 +57,9 @@ class Fleet:
 
     def start(self, role: str, worker: str, arguments: list[str]) -> None:
         process = ManagedProcess(role, worker, arguments, self._logs / f"{worker}.log")
-        if process.log_path.exists():
-            process.log_read = process.log_path.stat().st_size
         self._processes.append(process)
         process.start()
+        process.log_read = process.log_begin
 
     def watch(self) -> str | None:
         """Restart what crashed; the reason to end the run, if there is one.

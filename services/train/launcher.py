@@ -25,6 +25,7 @@ from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.train.fleet import Fleet
+from mrcdrl.services.train.resuming import check_unfinished
 
 _LOG = logging.getLogger("train")
 _TICK_S = 0.25
@@ -54,7 +55,13 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
             parser.error("--resume keeps the run's name and configuration: no --name or --config")
         resumed = Path(arguments.resume)
         folder = resumed.parent if len(resumed.parts) > 1 else arguments.run_dir
-        return RunDirectory.resume(folder / check_name(resumed.name, "run name"), given)
+        path = folder / check_name(resumed.name, "run name")
+
+        def check(before: Config, now: Config) -> None:
+            check_possible(now, resumed=True)
+            check_unfinished(path, before, now, given)
+
+        return RunDirectory.resume(path, given, check)
     preset = arguments.config or DEFAULT_PRESET
     config = load_config(preset, given)
     check_possible(config)
@@ -62,14 +69,14 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     return RunDirectory.create(arguments.run_dir / check_name(name, "run name"), config)
 
 
-def check_possible(config: Config) -> None:
+def check_possible(config: Config, *, resumed: bool = False) -> None:
     """Refuse a run that no service could serve.
 
-    Raises ConfigError if the robots do not fit or the initial weights are missing, EndpointError if
-    a port is in use.
+    resumed: the run needs its initial weights no more. Raises ConfigError if the robots do not fit
+    or the initial weights are missing, EndpointError if a port is in use.
     """
     test_starts(config.arena, 1, config.evaluator.seed)
-    initial_weights = config.learner.initial_weights
+    initial_weights = "" if resumed else config.learner.initial_weights
     if initial_weights and not Path(initial_weights).exists():
         raise ConfigError(f"learner.initial_weights {initial_weights}: no such file or directory")
     if config.transport.connect:
@@ -91,6 +98,8 @@ def supervise(run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSig
     with join(fleet, config.transport, endpoint) as session:
         run.note_endpoint(endpoint)
         follower = Follower(session, Keys(run.path.name), state, recorder, rule)
+        if run.resumed:
+            rule.go_on()
         start_workers(run, fleet, endpoint)
         with display(state, run.path.name, lambda: follower.now) as show:
             reason = None
@@ -108,6 +117,7 @@ def supervise(run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSig
             _LOG.info("%s; stopping …", reason)
         fleet.stop()
         follower.listen(_TICK_S)
+    recorder.record_metrics(state, follower.now)
     recorder.write_summary(state, follower.now, reason)
     return reason
 

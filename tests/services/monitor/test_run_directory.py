@@ -1,11 +1,12 @@
 """A run directory is held by one process, and each of its errors is one line."""
 
+import re
 import threading
 from pathlib import Path
 
 import pytest
 
-from mrcdrl.common.config import Config, load_config
+from mrcdrl.common.config import Config, load_config, variable
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
@@ -112,10 +113,67 @@ def test_the_default_name_is_made_of_preset_robots_and_time(config: str) -> None
     assert default_name(config, 3).startswith("quick-3robots-2")
 
 
-@pytest.mark.parametrize("name", ["arena.num_robots", "agent.kind"])
-def test_a_resumed_run_keeps_its_arena_and_agent(tmp_path: Path, name: str) -> None:
-    RunDirectory.create(tmp_path / "run", Config()).close()
-    before = (tmp_path / "run" / "config.toml").read_bytes()
-    with pytest.raises(RunDirectoryError, match=f"{name} cannot be changed"):
-        RunDirectory.resume(tmp_path / "run", {name: "3"})
-    assert (tmp_path / "run" / "config.toml").read_bytes() == before
+CHANGES = {
+    "arena.num_robots": ("2", "3"),
+    "arena.step_reward": ("0.03", "0.0"),
+    "agent.kind": ("duel", "dqn"),
+    "agent.gamma": ("0.99", "0.5"),
+    "agent.n_step": ("1", "3"),
+    "agent.reward_scale": ("1.0", "0.1"),
+    "agent.optimizer": ("adam", "rmsprop"),
+    "replay.shards": ("1", "2"),
+    "learner.initial_weights": ("", "other.safetensors"),
+    "run.turn_size": ("0", "64"),
+}
+TURNS = {
+    "run.turn_size": ("64", "128"),
+    "actor.num_arenas": ("8", "4"),
+    "replay.min_size": ("50000", "40000"),
+    "replay.samples_per_insert": ("8.0", "4.0"),
+    "learner.batch_size": ("32", "64"),
+}
+
+
+@pytest.mark.parametrize("source", ["flag", "environment"])
+@pytest.mark.parametrize(
+    ("lockstep", "name"), [(False, n) for n in CHANGES] + [(True, n) for n in TURNS]
+)
+def test_a_resumed_run_keeps_what_its_records_depend_on(
+    tmp_path: Path, lockstep: bool, name: str, source: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, new = (TURNS if lockstep else CHANGES)[name]
+    made_with = load_config(None, {"run.turn_size": "64"} if lockstep else {}, environ={})
+    RunDirectory.create(tmp_path / "run", made_with).close()
+    file = tmp_path / "run" / "config.toml"
+    before = file.read_bytes()
+    given = {name: new} if source == "flag" else {}
+    if source == "environment":
+        monkeypatch.setenv(variable(*name.split(".")), new)
+    with pytest.raises(RunDirectoryError) as refused:
+        RunDirectory.resume(tmp_path / "run", given)
+    line = str(refused.value)
+    assert re.search(rf"{name} is {new} here and {old} in .*run, whose", line)
+    assert variable(*name.split(".")) in line
+    assert "\n" not in line
+    assert file.read_bytes() == before
+
+
+def test_settings_that_nothing_depends_on_may_change(path: Path) -> None:
+    RunDirectory.create(path, CONFIG).close()
+    given = {"agent.learning_rate": "1e-5", "learner.batch_size": "16", "replay.capacity": "90_000"}
+    with RunDirectory.resume(path, {**given, "arena.num_robots": "3"}) as run:  # 3 as before
+        assert run.config.learner.batch_size == 16
+
+
+def test_a_run_that_a_check_refuses_stays_as_it_was(path: Path) -> None:
+    RunDirectory.create(path, CONFIG).close()
+    before = (path / RUN_CONFIG).read_bytes()
+
+    def refuse(was: Config, now: Config) -> None:
+        assert (was.run.minutes, now.run.minutes) == (CONFIG.run.minutes, 7)
+        raise RunDirectoryError("nothing left to do")
+
+    with pytest.raises(RunDirectoryError, match="nothing left"):
+        RunDirectory.resume(path, {"run.minutes": "7"}, refuse)
+    assert (path / RUN_CONFIG).read_bytes() == before
+    RunDirectory.resume(path, {}).close()  # it is held no more

@@ -81,14 +81,14 @@ def test_a_learner_back_at_its_checkpoint_has_that_step_and_no_negative_rate() -
 
 def test_what_earlier_processes_collected_is_added() -> None:
     state = RunState(config())
-    state.restore_counted(1_000, 2_000, 0)
+    state.restore_counted({"env_steps": 1_000, "robot_steps": 2_000})
     state.observe_stats(actor(5), 0)
     assert (state.env_steps, state.robot_steps) == (1_005, 2_010)
 
 
 def test_the_learners_step_is_known_before_it_reports_again() -> None:
     state = RunState(config())
-    state.restore_counted(0, 0, 700)
+    state.restore_counted({"learner_steps": 700})
     assert state.learner_steps == 700
     state.observe_stats(learner(650), 0)  # back at its checkpoint
     assert state.learner_steps == 650
@@ -96,7 +96,10 @@ def test_the_learners_step_is_known_before_it_reports_again() -> None:
 
 def test_an_actor_that_outlived_the_recorder_is_not_counted_twice() -> None:
     state = RunState(config())
-    state.restore_counted(1_000, 2_000, 0, {("0", "env_steps"): 400, ("1", "env_steps"): 600})
+    state.restore_counted(
+        {"env_steps": 1_000, "robot_steps": 2_000},
+        {("0", "env_steps"): 400, ("1", "env_steps"): 600},
+    )
     state.observe_stats(Stats("actor", "0", {"env_steps": 450}, {}), 0)
     state.observe_stats(Stats("actor", "1", {"env_steps": 7}, {}), 0)  # itself new
     assert state.env_steps == 1_057

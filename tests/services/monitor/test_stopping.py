@@ -100,3 +100,43 @@ def test_an_evaluation_of_weights_never_published_ends_no_run() -> None:
     rule.observe_evaluation(evaluation(0.95, 10**18 + 1, 7))
     assert rule.reason(0, 0.0, (epoch, 6)) is None
     assert "success 0.950 reached" in str(rule.reason(0, 0.0, (epoch, 7)))
+
+
+def test_a_target_reached_before_a_resume_ends_the_run_no_more() -> None:
+    rule = StoppingRule(RunConfig(target_success_rate=0.9))
+    rule.observe_evaluation(evaluation(0.95))
+    assert rule.reason(0, 0.0, (1.0, 1)) is not None
+    rule.go_on()
+    assert rule.reason(0, 0.0, (1.0, 1)) is None
+    rule.observe_evaluation(evaluation(0.97, version=2))
+    assert rule.reason(0, 0.0, (1.0, 2)) is None
+
+
+def test_a_target_not_reached_before_a_resume_ends_the_run() -> None:
+    rule = StoppingRule(RunConfig(target_success_rate=0.9))
+    rule.observe_evaluation(evaluation(0.8))
+    rule.go_on()
+    rule.observe_evaluation(evaluation(0.95))
+    assert rule.reason(0, 0.0, (1.0, 1)) is not None
+
+
+def test_patience_that_was_over_counts_from_the_resume() -> None:
+    rule = StoppingRule(RunConfig(patience_episodes=50))
+    for outcome in [WON] * 60 + [LOST] * 200:
+        rule.observe_episode(episode(outcome))
+    assert rule.reason(0, 0.0, NOTHING) is not None
+    rule.go_on()
+    for _ in range(50):
+        assert rule.reason(0, 0.0, NOTHING) is None
+        rule.observe_episode(episode(LOST))
+    assert "in 50 episodes" in str(rule.reason(0, 0.0, NOTHING))
+
+
+def test_patience_that_was_not_over_goes_on_counting_after_a_resume() -> None:
+    rule = StoppingRule(RunConfig(patience_episodes=50))
+    for outcome in [WON] * 100 + [LOST] * 30:
+        rule.observe_episode(episode(outcome))
+    rule.go_on()
+    for _ in range(20):
+        rule.observe_episode(episode(LOST))
+    assert rule.reason(0, 0.0, NOTHING) is not None

@@ -132,6 +132,17 @@ def test_a_process_that_fails_at_once_ends_the_run_with_its_reason(
         watch_until_ended(fleet)
 
 
+def test_the_reason_of_an_end_is_not_quoted_from_an_earlier_run(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", _DEADLINE_S)
+    (beside / "actor-0.log").write_text("10:00 INFO actor: all was well\n")
+    put(beside, "actor", "import sys; sys.exit(1)")
+    fleet.start("actor", "actor-0", [])
+    with pytest.raises(MrcdrlError, match=r"actor-0 failed: its log is empty"):
+        watch_until_ended(fleet)
+
+
 def test_a_process_that_was_killed_is_restarted(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
