@@ -54,7 +54,7 @@ class StoppingRule:
         """Why the run is over; None while it goes on.
 
         published: epoch and version of the learner's last publication. An evaluation of later ones
-        is no evaluation of this run's, or not yet.
+        does not belong to this run, or not yet.
         """
         run = self._run
         reached = None if self._goes_on else self._reached
