@@ -17,7 +17,8 @@ import torch
 from mrcdrl.common.arena import make_codec
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import Chunk, Samples, UInt8Array
-from mrcdrl.common.runtime.process import StopSignal, available_cores
+from mrcdrl.common.runtime.cores import available_cores
+from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.actor.sender import Sender

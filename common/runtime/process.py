@@ -119,8 +119,3 @@ def yield_cores(nice: int, autogroup: Path = Path("/proc/self/autogroup")) -> No
     if os.getsid(0) == os.getpid():
         with contextlib.suppress(OSError):  # not Linux, no groups, or a limit of the system
             autogroup.write_text(f"{level}\n", "ascii")
-
-
-def available_cores() -> int:
-    """The number of cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -8,7 +8,8 @@ from contextlib import ExitStack
 import torch
 
 from mrcdrl.common.config import Config
-from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal, available_cores
+from mrcdrl.common.runtime.cores import available_cores
+from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.sync.stats import StatsReporter

@@ -14,8 +14,9 @@ from mrcdrl.common.arena import test_starts
 from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import ConfigError, EndpointError
+from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.names import check_name
-from mrcdrl.common.runtime.process import COMMAND, StopSignal, available_cores
+from mrcdrl.common.runtime.process import COMMAND, StopSignal
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import SharedMemoryError
-from mrcdrl.common.runtime.process import ALLOCATOR, available_cores
+from mrcdrl.common.runtime.cores import allowed_cores, cpu_quota
+from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.runtime.versions import installed
 from mrcdrl.common.transport.shared_memory import SharedBuffer
 from mrcdrl.services.replay.client import table_bytes
@@ -38,7 +39,7 @@ def of_this_machine(config: Config, run_dir: Path, *, running: bool) -> Iterator
     """
     yield python_and_packages(requirements(), pins(CONSTRAINTS))
     yield clock()
-    yield cores(config, available_cores(), cpu_quota(_CGROUP), os.environ)
+    yield cores(config, allowed_cores(), cpu_quota(), os.environ)
     yield memory(0 if running else table_bytes(config), free_memory(_CGROUP))
     yield shared_memory()
     yield allocator(os.environ, learns=installed("torch") is not None)
@@ -102,15 +103,6 @@ def clock(now_s: float | None = None) -> Finding:
     return ok("clock", f"the year is {year}; monotonic to {info.resolution:g} s")
 
 
-def cpu_quota(cgroup: Path) -> float | None:
-    """CPU quota of this container, in cores; None if unlimited."""
-    try:
-        quota, period = (cgroup / "cpu.max").read_text("ascii").split()
-    except (OSError, ValueError):
-        return None
-    return None if quota == "max" else int(quota) / int(period)
-
-
 def cores(config: Config, num: int, quota: float | None, environ: Mapping[str, str]) -> Finding:
     """Compare the threads of each process with the cores and the CPU quota."""
     may_use = num if quota is None else min(num, quota)
@@ -125,10 +117,7 @@ def cores(config: Config, num: int, quota: float | None, environ: Mapping[str, s
     if many:
         fix = "lower it to the number of cores: threads wait for one another"
         return warning("cores", f"{said}; {', '.join(many)}", fix)
-    if quota is not None and quota <= num / 2 and not config.learner.threads:
-        fix = f"set learner.threads to {max(1, int(quota // 2))}: the default is half the cores"
-        return warning("cores", said, fix)
-    if num < 2:
+    if may_use < 2:
         return warning("cores", said, "actors and learner share one core; more cores are faster")
     return ok("cores", said)
 

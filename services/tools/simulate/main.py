@@ -16,8 +16,9 @@ from contextlib import ExitStack
 from mrcdrl.common.config import DEFAULT_PRESET, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import ConfigError
+from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.names import check_name
-from mrcdrl.common.runtime.process import StopSignal, available_cores
+from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.versions import all_versions
 from mrcdrl.services.monitor.summary import machine
 from mrcdrl.services.tools.simulate.simulation import Demand, simulation

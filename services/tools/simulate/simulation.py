@@ -22,7 +22,8 @@ import numpy as np
 from mrcdrl.common.errors import MrcdrlError, WireError
 from mrcdrl.common.messages.trajectory import Float64Array, Stats
 from mrcdrl.common.messages.wire import decode_published, encode_parts
-from mrcdrl.common.runtime.process import StopSignal, available_cores
+from mrcdrl.common.runtime.cores import available_cores
+from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.simulate.actors import BEGIN, STOP, Plan, Tally, act, episode_chunks

@@ -16,7 +16,6 @@ from mrcdrl.services.tools.doctor.machine import (
     allocator,
     clock,
     cores,
-    cpu_quota,
     disk,
     free_memory,
     memory,
@@ -77,8 +76,10 @@ def test_the_clock() -> None:
         (8, None, 9, {}, "warning"),
         (8, None, 0, {"OMP_NUM_THREADS": "16"}, "warning"),
         (8, None, 0, {"OMP_NUM_THREADS": "4,2"}, "ok"),
-        (8, 2.0, 0, {}, "warning"),
+        (8, 2.0, 0, {}, "ok"),
         (8, 2.0, 2, {}, "ok"),
+        (8, 2.0, 3, {}, "warning"),
+        (8, 1.5, 0, {}, "warning"),
         (1, None, 0, {}, "warning"),
     ],
 )
@@ -87,15 +88,6 @@ def test_cores(
 ) -> None:
     config = load_config("smoke", {"learner.threads": str(threads)}, environ={})
     assert cores(config, num, quota, environ).verdict == verdict
-
-
-@pytest.mark.parametrize(
-    ("text", "quota"), [("max 100000", None), ("150000 100000", 1.5), ("odd", None)]
-)
-def test_the_quota_of_a_container(tmp_path: Path, text: str, quota: float | None) -> None:
-    assert cpu_quota(tmp_path) is None
-    (tmp_path / "cpu.max").write_text(text)
-    assert cpu_quota(tmp_path) == quota
 
 
 def test_memory(tmp_path: Path) -> None:
