@@ -112,6 +112,7 @@ class EvaluatorMetrics:
 
     evaluations: Counter  # finished since the process started
     weights_version: Gauge  # being evaluated, or evaluated last; -1 before the first
+    weights_refused: Counter  # messages that broke the schema or did not fit the network
     busy: Gauge  # flag: evaluating now
 
 

@@ -9,7 +9,6 @@ thread. It asks for the configuration, and for weights: the first, or after a lo
 """
 
 import contextlib
-import logging
 import time
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrcdrl.common.config import load_transport
-from mrcdrl.common.errors import CheckpointError, DeadlineError
+from mrcdrl.common.errors import DeadlineError
 from mrcdrl.common.messages.trajectory import UInt8Array, Weights
 from mrcdrl.common.model.policy import FrameStack, make_policy
 from mrcdrl.common.runtime.closing import Closing
@@ -25,8 +24,6 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session
-
-_LOG = logging.getLogger("live")
 
 
 class LivePolicy(Closing):
@@ -48,7 +45,6 @@ class LivePolicy(Closing):
     ) -> None:
         self._epsilon = epsilon
         self._rng = np.random.default_rng(seed)
-        self._foreign = 0
         self._fresh = np.ones(0, np.bool_)
         self._adopted_s = time.monotonic()
         transport = load_transport({}).model_copy(update={"connect": (endpoint,), "listen": ()})
@@ -57,14 +53,12 @@ class LivePolicy(Closing):
         with contextlib.ExitStack() as opened:
             session = opened.enter_context(Session(transport, open_timeout_s=timeout_s))
             self.config = fetch_config(session, joining, stop, timeout_s)
-            self._reader = WeightsReader(session, joining.keys)
             self._policy = make_policy(self.config)
-            first = self._reader.wait(stop, timeout_s)
-            if first is None:
+            self._reader = WeightsReader(session, joining.keys, self._adopt)
+            if self._reader.wait(stop, timeout_s) is None:
                 raise DeadlineError(
                     f"no weights of run {run!r} came within {timeout_s:g} s; is its learner up?"
                 )
-            self._adopt(first)
             self._opened = opened.pop_all()
 
     def close(self) -> None:
@@ -87,7 +81,7 @@ class LivePolicy(Closing):
     @property
     def refused(self) -> int:
         """Number of weights that were torn, altered, too large or of another network."""
-        return self._reader.refused + self._foreign
+        return self._reader.refused
 
     def begin(self, robots: NDArray[np.integer] | slice = slice(None)) -> None:
         """Begin an episode of these robots: their next images start new stacks."""
@@ -99,13 +93,7 @@ class LivePolicy(Closing):
         observations: the N robots' images, uint8 [N, V, V], which are stacked on their earlier
         ones; or whole states, uint8 [N, S, V, V]. Another N starts new stacks for all robots.
         """
-        newer = self._reader.latest()
-        if newer is not None:
-            try:
-                self._adopt(newer)
-            except CheckpointError as error:  # the old ones stay
-                self._foreign += 1
-                _LOG.warning("weights %d refused: %s", newer.version, error)
+        self._reader.latest()
         states = observations if observations.ndim == 4 else self._stacked(observations)
         return self._policy.select_actions(states, self._epsilon, self._rng).actions
 

@@ -1,7 +1,8 @@
 """Live weights: the learner publishes, late joiners ask once, every reader keeps the newest.
 
-Invariants: a reader's weights only ever get newer, by (epoch, version); a message that is torn,
-altered or foreign is counted and dropped. Bytes in, bytes out: no torch here.
+Invariants: a reader's weights only ever get newer, by (epoch, version), and only what was adopted
+makes others old; a message that is torn, altered or of another network is refused: counted and
+dropped. Bytes in, bytes out: no torch here.
 """
 
 import contextlib
@@ -11,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from mrcdrl.common.errors import TransportError, WireError
+from mrcdrl.common.errors import CheckpointError, TransportError, WireError
 from mrcdrl.common.messages.framing import Part
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.messages.wire import decode, encode
@@ -90,13 +91,22 @@ class WeightsWriter:
 class WeightsReader:
     """Follows the newest weights of a run.
 
-    silence_s: after this long without a publication the reader asks the learner, because a link
-    that was lost may come back without its subscriptions.
+    adopt: puts weights into use, or raises CheckpointError if they are another network's; by
+    default, all are taken. silence_s: after this long without newer weights the reader asks the
+    learner, because a link that was lost may come back without its subscriptions.
     """
 
-    def __init__(self, session: Session, keys: Keys, *, silence_s: float = _SILENCE_S) -> None:
+    def __init__(
+        self,
+        session: Session,
+        keys: Keys,
+        adopt: Callable[[Weights], None] = lambda _weights: None,
+        *,
+        silence_s: float = _SILENCE_S,
+    ) -> None:
         self._subscriber = session.latest_subscriber(keys.weights)
         self._client = session.client(keys.weights, "the learner", timeout_s=2.0)
+        self._adopt = adopt
         self._silence_s = silence_s
         self._heard_s = time.monotonic()
         self._asked: PendingReply | None = None
@@ -105,16 +115,13 @@ class WeightsReader:
 
     @property
     def refused(self) -> int:
-        """Messages that were torn, altered, foreign or too large."""
+        """Messages that were torn, altered, too large or of another network."""
         return self._refused + self._subscriber.oversized
 
     def latest(self, timeout_s: float = 0.0) -> Weights | None:
-        """Weights newer than any returned before; None if none came within the time."""
-        published = self._subscriber.take(timeout_s)
-        if published is None:
-            return self._newer(self._answer_after_silence())
-        self._heard_s = time.monotonic()
-        return self._newer(published)
+        """Newer weights, which are adopted now; None if none came within the time."""
+        weights = self._adopted(self._subscriber.take(timeout_s))
+        return weights or self._adopted(self._answer_after_silence())
 
     def wait(
         self,
@@ -122,13 +129,13 @@ class WeightsReader:
         timeout_s: float = math.inf,
         meanwhile: Callable[[], None] = lambda: None,
     ) -> Weights | None:
-        """Ask and listen for the first weights; None when stopped or out of time.
+        """Ask and listen for the first weights, adopted then; None when stopped or out of time.
 
         meanwhile: called several times a second at best, every few seconds at worst.
         """
         logged, deadline = False, time.monotonic() + timeout_s
         while not stop.is_set() and time.monotonic() < deadline:
-            weights = self._newer(self._ask()) or self.latest(_RETRY_S)
+            weights = self._adopted(self._ask()) or self.latest(_RETRY_S)
             if weights is not None:
                 return weights
             if not logged:
@@ -159,16 +166,23 @@ class WeightsReader:
         except TransportError:
             return None  # no learner yet; the caller asks again
 
-    def _newer(self, payload: Part | None) -> Weights | None:
+    def _adopted(self, payload: Part | None) -> Weights | None:
+        """The message's weights once they are adopted; None if they are not newer, or refused."""
         if payload is None:
             return None
         try:
             weights = decode(Weights, payload)
-        except WireError as error:
-            self._refused += 1
-            _LOG.warning("weights refused: %s", error)
+            if weights.order <= self._order:
+                return None
+            self._adopt(weights)
+        except (WireError, CheckpointError) as error:
+            self._refuse(error)
             return None
-        if weights.order <= self._order:
-            return None
-        self._order = weights.order
+        self._order, self._heard_s = weights.order, time.monotonic()
         return weights
+
+    def _refuse(self, error: Exception) -> None:
+        """Count a message; log the 1st, 2nd, 4th, 8th …, as a peer may send many."""
+        self._refused += 1
+        if self._refused.bit_count() == 1:
+            _LOG.warning("weights refused, %d so far: %s", self._refused, error)

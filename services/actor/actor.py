@@ -3,7 +3,6 @@
 `Actor` goes at its own pace, `LockstepActor` collects once for each turn of the learner.
 """
 
-import logging
 import time
 import zlib
 from collections.abc import Sequence
@@ -12,7 +11,6 @@ import numpy as np
 
 from mrcdrl.common.arena import make_arenas, make_codec
 from mrcdrl.common.config import Config
-from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.metrics import ActorMetrics
 from mrcdrl.common.messages.trajectory import Chunk, EpisodeSummary, Float32Array, Weights
 from mrcdrl.common.messages.wire import encode
@@ -30,7 +28,6 @@ from mrcdrl.services.actor.collector import Collector
 from mrcdrl.services.actor.lease import ALONE, ExplorationRank, LeaseClient
 from mrcdrl.services.actor.sender import Sender
 
-_LOG = logging.getLogger("actor")
 _LISTEN_S = 0.2
 
 
@@ -50,7 +47,7 @@ class Actor:
         self._worker = worker
         self._sender = sender
         self._lease = lease
-        self._reader = WeightsReader(session, keys)
+        self._reader = WeightsReader(session, keys, self._adopt)
         self._episodes = session.publisher(keys.episodes(worker))
         self._reporter = StatsReporter(
             session.publisher(keys.stats("actor", worker)), "actor", worker
@@ -60,12 +57,11 @@ class Actor:
         self._adopted_s = time.monotonic()
         self._epsilons = self._explore(lease.rank)
         self._waited_s = 0.0
-        self._refused = 0  # weights of another network
         self._started_s = time.monotonic()
 
     def run(self, stop: StopSignal) -> None:
         """Wait for the first weights, then collect until stopped."""
-        self._adopt(self._reader.wait(stop, meanwhile=self._report))
+        self._reader.wait(stop, meanwhile=self._report)
         self._epsilons = self._explore(self._lease.rank)
         while not stop.is_set():
             self._advance(stop)
@@ -99,23 +95,15 @@ class Actor:
 
     def _adopt_newer(self) -> None:
         """Adopt newer weights; update epsilon when they or the exploration rank changed."""
-        adopted = self._adopt(self._reader.latest())
+        newer = self._reader.latest()
         self._lease.follow()
-        if adopted or self._lease.rank != self._rank:
+        if newer is not None or self._lease.rank != self._rank:
             self._epsilons = self._explore(self._lease.rank)
 
-    def _adopt(self, weights: Weights | None) -> bool:
-        """Act by these weights from now on; False for None and for another network's weights."""
-        if weights is None:
-            return False
-        try:
-            self._policy.adopt(weights)
-        except CheckpointError as error:
-            self._refused += 1
-            _LOG.warning("weights %d refused: %s", weights.version, error)
-            return False
+    def _adopt(self, weights: Weights) -> None:
+        """Act by these weights from now on; raises CheckpointError for another network's."""
+        self._policy.adopt(weights)
         self._adopted_s = time.monotonic()
-        return True
 
     def _explore(self, rank: ExplorationRank) -> Float32Array:
         """Epsilon of each arena at this exploration rank."""
@@ -140,7 +128,7 @@ class Actor:
             spool_chunks=self._sender.spooled,
             weights_version=self._policy.weights_version,
             weights_age_s=now - self._adopted_s,
-            weights_refused=self._reader.refused + self._refused,
+            weights_refused=self._reader.refused,
             slot=self._lease.slot,
             epsilon_min=float(self._epsilons.min()),
             epsilon_max=float(self._epsilons.max()),
@@ -175,7 +163,7 @@ class LockstepActor(Actor):
             self._collect(turn, stop)
             self._done = turn
         self._sender.check()
-        self._adopt(self._reader.latest(_LISTEN_S))
+        self._reader.latest(_LISTEN_S)
         self._report()
 
     def _collect(self, turn: int, stop: StopSignal) -> None:

@@ -1,7 +1,6 @@
 """`mrcdrl evaluator`: evaluate a run's live weights again and again, and keep the best."""
 
 import dataclasses
-import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +24,6 @@ from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.score import evaluation
 from mrcdrl.services.evaluator.trial import PolicyPlayer, play
 
-_LOG = logging.getLogger("evaluator")
 _POLL_S = 0.2
 _WORTH_CONFIRMING = 0.9  # success; below it, learning outruns luck
 _CONFIRMING_SEED = 500_000  # added to evaluator.seed: no test that is quoted has these starts
@@ -40,8 +38,8 @@ class Evaluator:
         keys, worker = joining.keys, joining.worker
         self._settings = config.evaluator
         self._stop = stop
-        self._reader = WeightsReader(session, keys)
         self._evaluator = WeightsEvaluator(config, worker)
+        self._reader = WeightsReader(session, keys, self._evaluator.adopt)
         confirmer = WeightsEvaluator(confirming(config), worker)
         self._best = BestWeights(
             joining.run_dir / BEST_WEIGHTS,
@@ -68,11 +66,7 @@ class Evaluator:
     def _evaluate(self, weights: Weights) -> None:
         """Evaluate one version, publish the result, keep the weights if they are the best."""
         self._version, self._busy = weights.version, True
-        try:
-            result = self._evaluator.evaluate(weights, self._keep_going)
-        except CheckpointError as error:
-            _LOG.warning("weights %d refused: %s", weights.version, error)
-            result = None
+        result = self._evaluator.evaluate(weights, self._keep_going)
         if result is not None:
             self._evaluations += 1
             self._publisher.put(encode(result))
@@ -82,10 +76,11 @@ class Evaluator:
     def _newest_after(self, until_s: float) -> Weights | None:
         """Wait until this time and for newer weights; return them, or None once stopped."""
         newest: Weights | None = None
-        while newest is None or time.monotonic() < until_s:
-            if not self._keep_going():
-                return None
-            newest = self._reader.latest(_POLL_S) or newest
+        while newest is None and self._keep_going():
+            if time.monotonic() < until_s:
+                self._stop.wait(_POLL_S)
+            else:
+                newest = self._reader.latest(_POLL_S)
         return newest
 
     def _keep_going(self) -> bool:
@@ -98,7 +93,10 @@ class Evaluator:
 
     def _metrics(self) -> EvaluatorMetrics:
         return EvaluatorMetrics(
-            evaluations=self._evaluations, weights_version=self._version, busy=self._busy
+            evaluations=self._evaluations,
+            weights_version=self._version,
+            weights_refused=self._reader.refused,
+            busy=self._busy,
         )
 
 
@@ -123,6 +121,10 @@ class WeightsEvaluator:
             config.arena, config.evaluator.episodes, config.evaluator.seed
         )
 
+    def adopt(self, weights: Weights) -> None:
+        """Take the weights to evaluate; raises CheckpointError for another network's."""
+        self._policy.adopt(weights)
+
     def evaluate(self, weights: Weights, keep_going: Callable[[], bool]) -> Evaluation | None:
         """Evaluate the weights; None without starts, and as soon as `keep_going` returns False.
 
@@ -131,7 +133,7 @@ class WeightsEvaluator:
         if not self._starts:
             return None
         config, began_s = self._config, time.monotonic()
-        self._policy.adopt(weights)
+        self.adopt(weights)
         player = PolicyPlayer(
             config.arena,
             make_codec(config.arena),

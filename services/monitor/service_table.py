@@ -91,7 +91,8 @@ def figures(state: RunState, service: Service, now: float) -> str:
                 render=actor.draw_share,
                 wait=actor.wait_share,
             )
-            return f"{slot} · {rate} steps/s{_age(state, service)} · {busy}"
+            refused = _refused(actor.weights_refused)
+            return f"{slot} · {rate} steps/s{_age(state, service)}{refused} · {busy}"
         case "replay":
             replay = service.read(ReplayMetrics)
             lost = f"{replay.gaps:.0f} gaps, {replay.refused:.0f} refused"
@@ -106,7 +107,8 @@ def figures(state: RunState, service: Service, now: float) -> str:
             evaluator = service.read(EvaluatorMetrics)
             doing = "evaluating" if evaluator.busy else "waiting after"
             done = f"{evaluator.evaluations:.0f} evaluations done"
-            return f"{doing} v{evaluator.weights_version:.0f} · {done}"
+            refused = _refused(evaluator.weights_refused)
+            return f"{doing} v{evaluator.weights_version:.0f} · {done}{refused}"
     return ""
 
 
@@ -117,6 +119,11 @@ def _age(state: RunState, actor: Service) -> str:
         return ""
     behind, seconds = staleness
     return f" · weights: {f'{behind} behind' if behind else 'current'}, {seconds:.0f} s old"
+
+
+def _refused(weights: float) -> str:
+    """How often a service has refused weights; empty for never."""
+    return f" · {weights:.0f} weights refused" if weights else ""
 
 
 def _percent(**shares: float) -> str:

@@ -81,6 +81,8 @@ def findings(last: Mapping[str, tuple[Stats, float]], presence: Presence) -> Ite
     """Check the services by their last statistics."""
     alive = [role_and_worker(key) for key in presence.alive()]
     yield services([role for role, _ in alive], [name for _, name in alive if name not in last])
+    refused = {name: stats.metrics.get("weights_refused", 0.0) for name, (stats, _) in last.items()}
+    yield weights(refused)
     yield clocks({name: ahead_s for name, (_, ahead_s) in last.items()})
     yield same_versions({name: stats.text for name, (stats, _) in last.items()}, versions())
 
@@ -97,6 +99,16 @@ def services(roles: list[str], silent: list[str]) -> Finding:
         fix = f"start `mrcdrl {missing[0]}`: the others wait for it"
         return warning("services", said, fix)
     return ok("services", said + (f"; silent: {', '.join(sorted(silent))}" if silent else ""))
+
+
+def weights(refused: Mapping[str, float]) -> Finding:
+    """Check that weights are adopted. refused: messages with weights, by the service's name."""
+    check = "weights"
+    name = max(refused, key=lambda name: refused[name], default="")
+    if not name or not refused[name]:
+        return ok(check, "none refused")
+    fix = "its log says why; a peer that is not this run's learner may publish under its name"
+    return warning(check, f"{name} has refused {refused[name]:.0f}", fix)
 
 
 def clocks(ahead_s: Mapping[str, float]) -> Finding:

@@ -2,7 +2,7 @@
 
 import importlib.util
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,11 +34,11 @@ class Run:
     writer: WeightsWriter
     session: Session
 
-    def publish(self, version: int, view_px: int = 32) -> bytes:
+    def publish(self, version: int, view_px: int = 32, epoch: int = 1) -> bytes:
         with torch.random.fork_rng():
             torch.manual_seed(version)
             payload = weights_to_bytes(QNetwork("duel", view_px=view_px))
-        self.writer.publish(Weights.of(1, version, 10 * version, payload))
+        self.writer.publish(Weights.of(epoch, version, 10 * version, payload))
         return payload
 
 
@@ -70,10 +70,14 @@ def images(step: int, num_robots: int = 2) -> UInt8Array:
 
 def adopted(policy: LivePolicy, version: int) -> None:
     """Act until it acts with this version."""
+    act_until(policy, lambda: policy.version == version)
+
+
+def act_until(policy: LivePolicy, reached: Callable[[], bool]) -> None:
     pause = threading.Event()
     for _ in range(300):
         policy.act(images(0))
-        if policy.version == version:
+        if reached():
             return
         pause.wait(0.1)
     raise AssertionError(f"still {policy}")
@@ -113,6 +117,17 @@ def test_it_follows_and_says_how_stale_it_is(run: Run) -> None:
         run.publish(4)
         adopted(policy, 4)
         assert "version=4" in repr(policy)
+
+
+def test_weights_of_another_network_do_not_block_those_of_the_run(run: Run) -> None:
+    run.publish(1)
+    with LivePolicy(RUN, run.endpoint) as policy:
+        for version in (2, 3):
+            refused = policy.refused
+            run.publish(10**6, view_px=40, epoch=2)
+            act_until(policy, lambda before=refused: policy.refused > before)
+            run.publish(version)
+            adopted(policy, version)
 
 
 def test_without_weights_it_says_so(run: Run) -> None:

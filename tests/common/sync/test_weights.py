@@ -1,5 +1,6 @@
 """A reader never returns torn or older weights, whatever arrives in whatever order."""
 
+import logging
 import time
 from concurrent.futures import Future
 from typing import Any
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrcdrl.common.config import TransportConfig
-from mrcdrl.common.errors import DeadlineError, WireError
+from mrcdrl.common.errors import CheckpointError, DeadlineError, WireError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.runtime.process import StopSignal
@@ -21,7 +22,7 @@ from mrcdrl.common.transport.keys import Keys
 MESSAGES = st.tuples(
     st.integers(0, 2),  # epoch
     st.integers(0, 5),  # version
-    st.sampled_from(["whole", "cut", "altered", "altered digest", "another's payload"]),
+    st.sampled_from(["whole", "cut", "altered", "altered digest", "another's payload", "foreign"]),
     st.integers(0, 10**6),  # where it is cut or altered
 )
 
@@ -31,8 +32,17 @@ def payload_of(epoch: int, version: int) -> bytes:
     return bytes([epoch, version]) * 50
 
 
+FOREIGN = b"of another network"
+
+
+def adopt(weights: Weights) -> None:
+    if weights.payload == FOREIGN:
+        raise CheckpointError("weights have view_px 40, not 60")
+
+
 def message(epoch: int, version: int, fault: str, place: int) -> bytes:
-    weights = Weights.of(epoch, version, 10 * version, payload_of(epoch, version))
+    payload = FOREIGN if fault == "foreign" else payload_of(epoch, version)
+    weights = Weights.of(epoch, version, 10 * version, payload)
     data = encode(weights)
     if fault == "cut":
         return data[: place % len(data)]
@@ -47,7 +57,14 @@ def message(epoch: int, version: int, fault: str, place: int) -> bytes:
         table["digest"] = weights.digest[:at] + other + weights.digest[at + 1 :]
     if fault == "another's payload":
         table["payload"] = payload_of(epoch, version + 1)
-    return data if fault == "whole" else msgpack.packb(table)
+    return data if fault in ("whole", "foreign") else msgpack.packb(table)
+
+
+class Answered(Future[bytes]):
+    """A reply that is there."""
+
+    def wait(self, _timeout_s: float) -> bool:
+        return True
 
 
 class Wire:
@@ -69,7 +86,7 @@ class Wire:
         return newest
 
     def ask(self, _request: bytes) -> Future[bytes]:
-        future: Future[bytes] = Future()
+        future: Future[bytes] = Answered()
         if self.answer is None:
             future.set_exception(DeadlineError("nobody answers"))
         else:
@@ -78,7 +95,7 @@ class Wire:
 
 
 def reader_of(wire: Wire) -> WeightsReader:
-    return WeightsReader(wire, Keys("run"))  # type: ignore[arg-type]
+    return WeightsReader(wire, Keys("run"), adopt)  # type: ignore[arg-type]
 
 
 @given(st.lists(MESSAGES, max_size=30))
@@ -88,7 +105,9 @@ def test_a_subscriber_never_sees_torn_or_older_weights(messages: list[Any]) -> N
     for epoch, version, fault, place in messages:
         wire.published = message(epoch, version, fault, place)
         found = reader.latest()
-        faults += fault != "whole"
+        faults += fault not in ("whole", "foreign") or (
+            fault == "foreign" and (epoch, version) > newest
+        )
         assert reader.refused == faults
         if fault != "whole" or (epoch, version) <= newest:
             assert found is None
@@ -115,6 +134,69 @@ def test_a_torn_answer_is_not_taken_for_the_first_weights() -> None:
     found = reader.wait(StopSignal())
     assert found is not None
     assert (found.version, reader.refused) == (4, 1)
+
+
+@pytest.mark.parametrize("fault", ["foreign", "altered"])
+@pytest.mark.parametrize("order", [(1, 10**9), (10**18, 0)])
+def test_refused_weights_do_not_block_good_ones(fault: str, order: tuple[int, int]) -> None:
+    wire = Wire()
+    reader = reader_of(wire)
+    wire.answer = message_of(1, 1)
+    assert reader.wait(StopSignal()) is not None
+    table = msgpack.unpackb(message(1, 1, fault, 7))
+    table["epoch"], table["version"] = order
+    for version in range(2, 5):
+        wire.published = msgpack.packb(table)
+        assert reader.latest() is None
+        wire.published = message_of(1, version)
+        found = reader.latest()
+        assert found is not None
+        assert found.order == (1, version)
+    assert reader.refused == 3
+
+
+def message_of(epoch: int, version: int) -> bytes:
+    return message(epoch, version, "whole", 0)
+
+
+def test_first_weights_that_are_refused_are_waited_on() -> None:
+    """Not returned, and asked for again only after listening."""
+    wire = Wire()
+    reader, waits = reader_of(wire), 0
+
+    def meanwhile() -> None:
+        nonlocal waits
+        waits += 1
+        wire.answer = message_of(1, 3) if waits == 2 else wire.answer
+
+    wire.answer = message(7, 7, "foreign", 0)
+    found = reader.wait(StopSignal(), meanwhile=meanwhile)
+    assert found is not None
+    assert (found.order, reader.refused, waits) == ((1, 3), 2, 2)
+
+
+def test_a_reader_that_hears_only_what_it_refuses_asks_the_learner() -> None:
+    wire = Wire()
+    reader = WeightsReader(wire, Keys("run"), adopt, silence_s=0.0)  # type: ignore[arg-type]
+    wire.answer = message_of(1, 1)
+    found = None
+    for _ in range(4):
+        wire.published = message(2, 2, "foreign", 0)
+        found = found or reader.latest()
+    assert found is not None
+    assert found.order == (1, 1)
+
+
+def test_many_refusals_are_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+    wire = Wire()
+    reader = reader_of(wire)
+    with caplog.at_level(logging.WARNING, "weights"):
+        for _ in range(1000):
+            wire.published = b"torn!"
+            assert reader.latest() is None
+    assert reader.refused == 1000
+    assert len(caplog.messages) == 10
+    assert "weights refused, 512 so far: not msgpack" in caplog.messages[-1]
 
 
 def test_a_reader_that_hears_nothing_asks_the_learner() -> None:

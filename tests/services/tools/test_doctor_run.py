@@ -15,10 +15,17 @@ from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.doctor.main import main
-from mrcdrl.services.tools.doctor.run import clocks, endpoints, listen, same_versions, services
+from mrcdrl.services.tools.doctor.run import (
+    clocks,
+    endpoints,
+    listen,
+    same_versions,
+    services,
+    weights,
+)
 
 RUN = "looked-at"
-IDLE = EvaluatorMetrics(evaluations=0, weights_version=0, busy=0)
+IDLE = EvaluatorMetrics(evaluations=0, weights_version=0, weights_refused=0, busy=0)
 
 
 class Run:
@@ -78,7 +85,7 @@ def test_a_run_that_is_up(run: Run, tmp_path: Path, capsys: pytest.CaptureFixtur
     run.add("learner")
     code, found = doctor(capsys, *join)
     assert code == 0
-    for check in ("endpoint", "session", "services", "clocks", "versions of the run", "memory"):
+    for check in ("endpoint", "session", "services", "weights", "clocks", "versions of the run"):
         assert found[check] == "ok", check
 
 
@@ -131,6 +138,12 @@ def test_services() -> None:
     assert services(["replay", "actor", "learner"], []).verdict == "ok"
     assert services(["replay", "actor", "learner", "status"], ["status"]).verdict == "ok"
     assert services(["actor", "learner"], []).verdict == "warning"
+
+
+def test_weights_that_a_service_refuses() -> None:
+    assert weights({}).verdict == weights({"a": 0.0}).verdict == "ok"
+    found = weights({"a": 1.0, "evaluator-0": 12.0, "b": 0.0})
+    assert (found.verdict, found.said) == ("warning", "evaluator-0 has refused 12")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,86 @@
+"""The evaluator, in a thread of the test: which weights it evaluates, and what it tells."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mrcdrl.common.config import TransportConfig, load_config
+from mrcdrl.common.messages.metrics import EvaluatorMetrics, read
+from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights
+from mrcdrl.common.messages.wire import decode_published, encode
+from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.joining import Joining
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.services.evaluator.evaluator import Evaluator
+
+SMALL = {
+    "arena.view_px": "32",
+    "arena.max_frames": "20",
+    "learner.precision": "float32",
+    "evaluator.episodes": "1",
+    "evaluator.period_s": "0",
+    "evaluator.max_share": "1",
+}
+CONFIG = load_config("smoke", SMALL, environ={})
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    with Session(TransportConfig(listen=(free_endpoint(),))) as opened:
+        yield opened
+
+
+def weights(epoch: int, version: int, view_px: int = 32) -> bytes:
+    network = QNetwork(CONFIG.agent.kind, view_px=view_px)
+    return encode(Weights.of(epoch, version, 10 * version, weights_to_bytes(network)))
+
+
+def eventually(reached: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60.0
+    while not reached():
+        assert time.monotonic() < deadline
+
+
+def test_refused_weights_are_told_and_do_not_block_good_ones(
+    session: Session, tmp_path: Path
+) -> None:
+    joining, stop = Joining("judged", "e", tmp_path, TransportConfig(), {}), StopSignal()
+    keys = joining.keys
+    statistics = session.queue_subscriber(keys.stats("evaluator", "e"))
+    results = session.queue_subscriber(keys.evaluation("e"))
+    publisher = session.publisher(keys.weights)
+    thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
+    thread.start()
+    judged: list[tuple[int, int]] = []
+    told = EvaluatorMetrics(evaluations=0, weights_version=0, weights_refused=0, busy=0)
+
+    def refused() -> bool:
+        nonlocal told
+        publisher.put(weights(2, 10**6, view_px=40))
+        item = statistics.take(0.1)
+        if item is not None:
+            told = read(EvaluatorMetrics, decode_published(Stats, *item).metrics)
+        return told.weights_refused > before
+
+    def evaluated(version: int) -> bool:
+        publisher.put(weights(1, version))
+        item = results.take(0.1)
+        if item is not None:
+            found = decode_published(Evaluation, *item)
+            judged.append((found.weights_epoch, found.weights_version))
+        return (1, version) in judged
+
+    try:
+        for version in (1, 2):
+            before = told.weights_refused
+            eventually(refused)
+            eventually(lambda latest=version: evaluated(latest))
+    finally:
+        stop.set()
+        thread.join()
+    assert {epoch for epoch, _ in judged} == {1}
