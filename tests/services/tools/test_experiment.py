@@ -393,3 +393,14 @@ def test_a_cell_that_never_reached_a_rate_counts_as_later(bench: Bench) -> None:
 def test_time_left_is_that_of_the_pace_so_far() -> None:
     assert time_left(60.0, 0.5, 1.5) == "0:03:00"
     assert time_left(60.0, 0.0, 1.5) == "unknown time"
+
+
+# -- grids to start from -----------------------------------------------------------------
+
+GRIDS = sorted((Path(__file__).parents[3] / "experiments").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
+def test_the_grids_to_start_from_are_whole_and_described(path: Path) -> None:
+    assert read_grid(path)
+    assert f"[{path.name}]({path.name})" in path.with_name("README.md").read_text("utf-8")
