@@ -34,7 +34,9 @@ def main() -> None:
         }
         config = load_config("quick", overrides, environ={})
         subject = Subject(config, None, check_controller(name), Weights.of(0, 0, 0, b""))
-        result, measures = evaluate(subject, arguments.episodes, arguments.seed, lambda _done: None)
+        result, measures, _ = evaluate(
+            subject, arguments.episodes, arguments.seed, lambda _done: None
+        )
         emit(
             {
                 "bench": "rivals",

@@ -16,6 +16,7 @@ from mrcdrl.common.arena.controllers import Controller
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import (
     NUM_ACTIONS,
+    BoolArray,
     Float64Array,
     Outcome,
     TimeStep,
@@ -38,11 +39,15 @@ class EpisodeResult:
     targets: Float64Array  # [M, 2] px
     obstacles: Float64Array  # [O, 3] px
     robots: Float64Array  # [frames + 1, K, 3]; [0, K, 3] if paths are not kept
+    explored: BoolArray  # [frames, K], actions that exploration changed; [0, K] likewise
     journey: Journey
 
 
 class Player(Protocol):
     """Chooses the actions of several arenas at once."""
+
+    explored: BoolArray
+    """Whether exploration changed the actions chosen last, [len(arenas), K]."""
 
     def begin(self, arena: int, time_step: TimeStep) -> None:
         """Begin an episode in this arena."""
@@ -74,6 +79,7 @@ class PolicyPlayer:
         self._epsilon = epsilon
         self._rng = rng
         self._frames = FrameStack(_MAX_ARENAS * config.num_robots, config.stack, config.view_px)
+        self.explored = np.zeros((0, config.num_robots), np.bool_)
 
     def begin(self, arena: int, time_step: TimeStep) -> None:
         first = arena * self._num_robots
@@ -83,7 +89,9 @@ class PolicyPlayer:
     def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
         stacks = self._frames.stacks[self._robots(arenas)]
         selection = self._policy.select_actions(stacks, self._epsilon, self._rng)
-        return selection.actions.reshape(len(arenas), self._num_robots)
+        actions = selection.actions.reshape(len(arenas), self._num_robots)
+        self.explored = actions != selection.q_values.argmax(axis=1).reshape(actions.shape)
+        return actions
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
         images = self._codec.decode(records.reshape(-1, records.shape[-1]))
@@ -108,6 +116,7 @@ class ControllerPlayer:
         self._controllers: dict[int, Controller] = {}
         self._epsilon = epsilon
         self._rng = rng
+        self.explored = np.zeros((0, 0), np.bool_)
 
     def begin(self, arena: int, time_step: TimeStep) -> None:
         self._controllers[arena] = self._make_controller()
@@ -117,6 +126,7 @@ class ControllerPlayer:
         actions = np.stack([self._controllers[arena](scene) for arena, scene in pairs])
         explores = self._rng.random(actions.shape) < self._epsilon
         uniform = self._rng.integers(NUM_ACTIONS, size=actions.shape, dtype=np.uint8)
+        self.explored = explores & (uniform != actions)
         return np.where(explores, uniform, actions)
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
@@ -138,12 +148,14 @@ def play(
     player: Player,
     *,
     keep_paths: bool = False,
+    keep_failed_paths: bool = False,
     keep_going: Callable[[int], bool] = lambda _done: True,
 ) -> list[EpisodeResult] | None:
     """Play an episode from each start; return the results in the order of the starts.
 
-    keep_paths: keep each episode's poses. keep_going: called before each step with the number of
-    finished episodes; None is returned as soon as it returns False.
+    keep_paths: keep each episode's poses and explored actions; keep_failed_paths: those of failures
+    only. keep_going: called before each step with the number of finished episodes; None is returned
+    as soon as it returns False.
     """
     num_arenas = min(len(starts), _MAX_ARENAS)
     # Starts are given; the generators serve random failures only.
@@ -152,6 +164,7 @@ def play(
     results: dict[int, EpisodeResult] = {}
     # One array: many small ones that outlive the network's tensors would fragment the memory.
     paths = np.empty((len(arenas), config.max_frames + 1, config.num_robots, 3), np.float64)
+    explored = np.empty((len(arenas), config.max_frames, config.num_robots), np.bool_)
     waiting = iter(enumerate(starts))
     running: dict[int, _Running] = {}
 
@@ -178,13 +191,22 @@ def play(
             episode = running[index]
             episode.score += float(steps.rewards[i].mean())
             paths[index, episode.frames] = scene.robots
+            explored[index, episode.frames] = player.explored[i]
             episode.frames += 1
-            if steps.outcomes[i] is not None:
+            outcome = steps.outcomes[i]
+            if outcome is not None:
                 last = arenas.scene(index)
                 paths[index, episode.frames] = last.robots
                 path = paths[index, : episode.frames + 1]
+                kept = keep_paths or (keep_failed_paths and outcome is not Outcome.SUCCESS)
                 results[episode.number] = _result(
-                    config, episode.score, path, last, steps[i], keep_path=keep_paths
+                    config,
+                    episode.score,
+                    path,
+                    explored[index, : episode.frames],
+                    last,
+                    steps[i],
+                    keep_path=kept,
                 )
                 begin(index)
     return [results[number] for number in range(len(starts))]
@@ -194,12 +216,14 @@ def _result(
     config: ArenaConfig,
     score: float,
     path: Float64Array,
+    explored: BoolArray,
     scene: Scene,
     last: TimeStep,
     *,
     keep_path: bool,
 ) -> EpisodeResult:
-    """The result of an episode, from its path [frames + 1, K, 3], last scene and last time step."""
+    """The result of an episode, from its path [frames + 1, K, 3], explored actions [frames, K],
+    last scene and last time step."""
     if last.outcome is None:
         raise ValueError("the episode has not ended")
     return EpisodeResult(
@@ -209,6 +233,7 @@ def _result(
         targets=scene.targets,
         obstacles=scene.obstacles,
         robots=path.copy() if keep_path else path[:0].copy(),
+        explored=explored.copy() if keep_path else explored[:0].copy(),
         journey=journey(
             path,
             scene.targets,

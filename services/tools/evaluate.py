@@ -1,4 +1,7 @@
-"""`mrcdrl evaluate`: the paper's test (section 5.3, Table 2) for weights or a controller."""
+"""`mrcdrl evaluate`: the paper's test (section 5.3, Table 2) for weights or a controller.
+
+With --failures, failed episodes are replayed after the test, whose own numbers stay the same.
+"""
 
 import dataclasses
 import json
@@ -10,10 +13,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from mrcdrl.common.arena import test_starts
+from mrcdrl.common.config.arguments import whole_number
 from mrcdrl.common.messages.trajectory import Evaluation
 from mrcdrl.services.evaluator.navigation import Navigation, navigation, navigation_table
 from mrcdrl.services.evaluator.score import evaluation
-from mrcdrl.services.evaluator.trial import play
+from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.services.tools.failure_summary import as_json, failure_table, summarize
+from mrcdrl.services.tools.failures import Failure
+from mrcdrl.services.tools.replays import failures_of, num_replays
 from mrcdrl.services.tools.subject import Subject, parse_with_episodes, subject, subject_parser
 
 
@@ -21,29 +28,54 @@ def main(argv: Sequence[str]) -> int:
     """Evaluate and print; return the exit code."""
     parser = subject_parser("evaluate", "The paper's test: one collision fails, epsilon 0.01.")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--failures",
+        nargs="?",
+        type=whole_number(0),
+        const=sys.maxsize,
+        metavar="N",
+        help="describe the first N failures (without N: all), and what share failed in which way",
+    )
     arguments = parse_with_episodes(parser, argv, 1100)
     evaluated = subject(arguments)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("episodes", total=arguments.episodes)
-        result, measures = evaluate(
+        result, measures, episodes = evaluate(
             evaluated,
             arguments.episodes,
             arguments.seed,
             lambda done: progress.update(task, completed=done),
+            keep_failed_paths=arguments.failures is not None,
         )
-    if arguments.json:
-        measured = {"navigation": dataclasses.asdict(measures)}
-        print(json.dumps(dataclasses.asdict(result) | measured))
-    else:
-        sys.stdout.write(table(result, evaluated) + navigation_table(measures))
+        failures: list[Failure] = []
+        if arguments.failures is not None:
+            task = progress.add_task("replays of failures", total=num_replays(episodes))
+            failures = failures_of(
+                evaluated, episodes, arguments.seed, lambda: progress.advance(task)
+            )
+    told = dataclasses.asdict(result) | {"navigation": dataclasses.asdict(measures)}
+    text = table(result, evaluated) + navigation_table(measures)
+    if arguments.failures is not None:
+        summary = summarize(failures, arguments.episodes)
+        told["failures"] = as_json(failures, summary, arguments.failures)
+        text += failure_table(failures, summary, arguments.failures)
+    sys.stdout.write(json.dumps(told) + "\n" if arguments.json else text)
     return 0
 
 
 def evaluate(
-    evaluated: Subject, episodes: int, seed: int, report: Callable[[int], None]
-) -> tuple[Evaluation, Navigation]:
-    """The paper's measures and those of navigation; report: called with the episodes finished."""
+    evaluated: Subject,
+    episodes: int,
+    seed: int,
+    report: Callable[[int], None],
+    *,
+    keep_failed_paths: bool = False,
+) -> tuple[Evaluation, Navigation, list[EpisodeResult]]:
+    """The paper's measures, those of navigation, and the episodes.
+
+    report: called with the number of episodes finished.
+    """
     began_s = time.monotonic()
     starts = test_starts(evaluated.config.arena, episodes, seed)
 
@@ -52,7 +84,16 @@ def evaluate(
         return True
 
     player = evaluated.player(seed)
-    results = play(evaluated.config.arena, starts, player, keep_going=keep_going) or []
+    results = (
+        play(
+            evaluated.config.arena,
+            starts,
+            player,
+            keep_failed_paths=keep_failed_paths,
+            keep_going=keep_going,
+        )
+        or []
+    )
     result = evaluation(
         results,
         worker=evaluated.controller or "evaluate",
@@ -62,7 +103,7 @@ def evaluate(
         wall_s=time.monotonic() - began_s,
     )
     outcomes, frames = [r.outcome for r in results], [r.frames for r in results]
-    return result, navigation(outcomes, frames, [r.journey for r in results])
+    return result, navigation(outcomes, frames, [r.journey for r in results]), results
 
 
 def table(result: Evaluation, evaluated: Subject) -> str:

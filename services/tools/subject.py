@@ -34,10 +34,13 @@ class Subject:
     controller: str | None
     weights: Weights  # for a controller: version 0 without parameters
 
-    def player(self, seed: int) -> Player:
-        """Make a player, its exploration drawn from the seed."""
+    def player(self, seed: int, epsilon: float | None = None) -> Player:
+        """Make a player that draws its exploration from the seed.
+
+        epsilon: the configuration's if None.
+        """
         arena, rng = self.config.arena, np.random.default_rng(seed)
-        epsilon = self.config.evaluator.epsilon
+        epsilon = self.config.evaluator.epsilon if epsilon is None else epsilon
         if self.policy is not None:
             return PolicyPlayer(arena, make_codec(arena), self.policy, epsilon, rng)
         name = self.controller or ""

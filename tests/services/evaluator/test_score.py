@@ -16,7 +16,14 @@ SUCCESS, COLLISION, TIMEOUT = Outcome.SUCCESS, Outcome.COLLISION, Outcome.TIMEOU
 
 def episode(outcome: Outcome, frames: int = 10, score: float = 1.0) -> EpisodeResult:
     return EpisodeResult(
-        outcome, frames, score, np.zeros((2, 2)), np.empty((0, 3)), np.empty((0, 2, 3)), JOURNEY
+        outcome=outcome,
+        frames=frames,
+        score=score,
+        targets=np.zeros((2, 2)),
+        obstacles=np.empty((0, 3)),
+        robots=np.empty((0, 2, 3)),
+        explored=np.empty((0, 2), np.bool_),
+        journey=JOURNEY,
     )
 
 

@@ -1,19 +1,34 @@
 """The paper's test: given starts, one collision is failure, the same seed the same result."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from mrcdrl.common.arena import LEFT, STRAIGHT, Scene, Start, layout_for, make_codec, test_starts
+from mrcdrl.common.arena import (
+    LEFT,
+    STRAIGHT,
+    Arena,
+    Scene,
+    Start,
+    layout_for,
+    make_codec,
+    test_starts,
+)
 from mrcdrl.common.arena.controllers import make_controller
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Outcome, TimeStep, UInt8Array
 from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.q_network import QNetwork
-from mrcdrl.services.evaluator.trial import ControllerPlayer, EpisodeResult, PolicyPlayer, play
+from mrcdrl.services.evaluator.trial import (
+    ControllerPlayer,
+    EpisodeResult,
+    Player,
+    PolicyPlayer,
+    play,
+)
 
 CONFIG = ArenaConfig(num_robots=2, view_px=32, max_frames=150)
 starts_of = test_starts  # else pytest takes it for a test
@@ -25,6 +40,7 @@ class SteadyPlayer:
 
     def __init__(self, action: int) -> None:
         self._action = action
+        self.explored = np.zeros((0, CONFIG.num_robots), np.bool_)
         self.begun: list[int] = []
         self.observed: list[tuple[int, ...]] = []
 
@@ -34,6 +50,7 @@ class SteadyPlayer:
 
     def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
         assert len(arenas) == len(scenes)
+        self.explored = np.zeros((len(arenas), CONFIG.num_robots), np.bool_)
         return np.full((len(arenas), CONFIG.num_robots), self._action, np.uint8)
 
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
@@ -118,6 +135,41 @@ def test_paths_are_kept_where_asked_for(keep_paths: bool) -> None:
     assert result.robots.shape == (result.frames + 1, 2, 3)
     np.testing.assert_allclose(result.robots[0], TOWARDS.robots)
     np.testing.assert_allclose(result.targets, TOWARDS.targets)
+
+
+def test_failed_paths_alone_are_kept_and_change_no_result() -> None:
+    starts = starts_of(CONFIG, 20, seed=3)
+    plain = play(CONFIG, starts, controlled("greedy", 0.1))
+    kept = play(CONFIG, starts, controlled("greedy", 0.1), keep_failed_paths=True) or []
+    assert outcomes(kept) == outcomes(plain)
+    assert {r.outcome is Outcome.SUCCESS for r in kept} == {True, False}
+    for result in kept:
+        played = 0 if result.outcome is Outcome.SUCCESS else result.frames
+        assert result.explored.shape == (played, 2)
+        assert len(result.robots) == (played + 1 if played else 0)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("make", [by_policy, lambda epsilon: controlled("greedy", epsilon)])
+def test_explored_are_the_actions_that_exploration_changed(
+    make: Callable[[float], Player], epsilon: float
+) -> None:
+    results = play(CONFIG, starts_of(CONFIG, 30, seed=1), make(epsilon), keep_paths=True) or []
+    explored = np.concatenate([r.explored for r in results])
+    # A uniform action is the best one in a third of all cases.
+    assert explored.mean() == pytest.approx(epsilon * 2 / 3, abs=0.05)
+
+
+def test_an_episode_may_begin_at_any_frame_of_a_path() -> None:
+    config = CONFIG.model_copy(update={"num_robots": 4, "num_obstacles": 1})
+    rng = np.random.default_rng(0)
+    player = ControllerPlayer(lambda: make_controller("random", config, rng), 0.0, rng)
+    results = play(config, starts_of(config, 10, seed=2), player, keep_paths=True) or []
+    arena = Arena(config, rng)
+    for result in results:
+        for robots in result.robots:
+            arena.reset(Start(robots, result.targets, result.obstacles))
+            np.testing.assert_array_equal(arena.scene.robots, robots)
 
 
 def test_no_starts_no_results() -> None:
