@@ -3,6 +3,7 @@
 import importlib
 import sys
 
+from mrcdrl.common.runtime.extras import named_extras
 from mrcdrl.common.runtime.process import run_main
 
 _COMMANDS = {
@@ -34,7 +35,11 @@ _COMMANDS = {
 
 
 def main() -> int:
-    """Dispatch to a command; the exit code."""
+    """Run a command; the exit code."""
+    return run_main(_dispatch)
+
+
+def _dispatch() -> int | None:
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
@@ -44,8 +49,10 @@ def main() -> int:
     if name not in _COMMANDS:
         sys.stderr.write(f"mrcdrl: no command {name!r}; the commands are {', '.join(_COMMANDS)}\n")
         return 2
-    command = importlib.import_module(_COMMANDS[name][0])
-    return run_main(lambda: command.main(arguments[words:]))
+    with named_extras():
+        command = importlib.import_module(_COMMANDS[name][0])
+        exit_code: int | None = command.main(arguments[words:])
+    return exit_code
 
 
 def _usage() -> str:

@@ -15,6 +15,7 @@ from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_c
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.cores import available_cores
+from mrcdrl.common.runtime.extras import require
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import COMMAND, StopSignal
 from mrcdrl.common.transport import Session, free_endpoint
@@ -73,9 +74,10 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
 def check_possible(config: Config, *, resumed: bool = False) -> None:
     """Refuse a run that no service could serve.
 
-    resumed: the run needs its initial weights no more. Raises ConfigError if the robots do not fit
-    or the initial weights are missing, EndpointError if a port is in use.
+    resumed: the run needs its initial weights no more. Raises ConfigError if the robots do not fit,
+    or a package or the initial weights are missing; EndpointError if a port is in use.
     """
+    require("torch", "safetensors")
     test_starts(config.arena, 1, config.evaluator.seed)
     initial_weights = "" if resumed else config.learner.initial_weights
     if initial_weights and not Path(initial_weights).exists():

@@ -6,10 +6,10 @@ Invariants: the same seed gives the same noise on every machine; each pixel take
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mrcdrl.common.messages.trajectory import UInt8Array
+from mrcdrl.common.runtime.compiled import compiled
 
 NoiseSeeds = NDArray[np.uint32]
 
@@ -28,7 +28,7 @@ def add_noise(views: UInt8Array, seeds: NoiseSeeds, deviation: float) -> None:
     _add_noise(views, np.ascontiguousarray(seeds), deviation / _DEVIATION)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _add_noise(views, seeds, scale):  # type: ignore[no-untyped-def]
     for n in range(len(views)):
         state = _mixed(np.uint64(seeds[n]) * _GAMMA)
@@ -44,7 +44,7 @@ def _add_noise(views, seeds, scale):  # type: ignore[no-untyped-def]
                 views[n, i, j] = np.uint8(min(max(intensity + 0.5, 0.0), 255.0))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _mixed(z):  # type: ignore[no-untyped-def]
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2

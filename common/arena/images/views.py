@@ -11,11 +11,11 @@ mapped image. Records of any bytes give some image: shapes that are not finite a
 import math
 
 import numpy as np
-from numba import njit
 
 from mrcdrl.common.arena.world.obstacles import inner_walls
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array
+from mrcdrl.common.runtime.compiled import compiled, inlined
 
 WALL_INTENSITY = 76  # OpenCV's grayscale weights, applied to red, green, blue and white
 OBSTACLE_INTENSITY = 150
@@ -62,7 +62,7 @@ class AnalyticViews:
         )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _render_views(  # type: ignore[no-untyped-def]
     scenes, out, counts, heading_up, scale, wall, inner_walls, halves_px, radius
 ):
@@ -111,19 +111,19 @@ def _render_views(  # type: ignore[no-untyped-def]
                 _bar(view, lines, x, y, across, along, -cap, reach, line_half, HEADING_INTENSITY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _on_grid(middle, half):  # type: ignore[no-untyped-def]
     """Moves the middle of a square of half-width half so that its edges lie between pixels."""
     return np.rint(np.float64(middle) - half) + half
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _map(x, y, c, s, scale, size):  # type: ignore[no-untyped-def]
     """Image coordinates of a position relative to the robot."""
     return (c * x - s * y) * scale + 0.5 * size, (s * x + c * y) * scale + 0.5 * size
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _walls_upright(view, own_x, own_y, scale, wall):  # type: ignore[no-untyped-def]
     outer, inner, size_px = wall
     half = 0.5 * view.shape[0]
@@ -139,7 +139,7 @@ def _walls_upright(view, own_x, own_y, scale, wall):  # type: ignore[no-untyped-
     _box(view, right_in, right, top_in, bottom_in, WALL_INTENSITY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _walls_slanted(view, lines, own_x, own_y, c, s, scale, wall):  # type: ignore[no-untyped-def]
     outer, inner, size_px = wall
     size = view.shape[0]
@@ -155,7 +155,7 @@ def _walls_slanted(view, lines, own_x, own_y, c, s, scale, wall):  # type: ignor
         _bar(view, lines, x, y, -s, c, 0.0, short, width, WALL_INTENSITY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _inner_walls(view, lines, own_x, own_y, c, s, scale, walls):  # type: ignore[no-untyped-def]
     for ax, ay, bx, by, half in walls:
         length = math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
@@ -165,13 +165,13 @@ def _inner_walls(view, lines, own_x, own_y, c, s, scale, walls):  # type: ignore
         _bar(view, lines, x, y, across, along, 0.0, length * scale, half * scale, WALL_INTENSITY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _blend(value, intensity, coverage):  # type: ignore[no-untyped-def]
     """A pixel's value once a shape covers this fraction of it."""
     return np.uint8(value + (intensity - np.float64(value)) * coverage + 0.5)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _box(view, x0, x1, y0, y1, intensity):  # type: ignore[no-untyped-def]
     """Renders the upright rectangle [x0, x1] x [y0, y1]."""
     size = view.shape[0]
@@ -195,7 +195,7 @@ def _box(view, x0, x1, y0, y1, intensity):  # type: ignore[no-untyped-def]
                 view[i, j] = _blend(view[i, j], intensity, tall * wide)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _pixels(low, high, size):  # type: ignore[no-untyped-def]
     """First and last + 1 of the rows, or columns, that [low, high] covers at least in part.
 
@@ -204,14 +204,14 @@ def _pixels(low, high, size):  # type: ignore[no-untyped-def]
     return np.uintp(max(low, 0.0)), np.uintp(math.ceil(min(high, np.float64(size))))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _slice(i, low, high, y):  # type: ignore[no-untyped-def]
     """The part of [low, high] in row i: its top relative to y, and its height."""
     top = max(np.float64(i), low) - y
     return top, min(i + 1.0, high) - y - top
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _place_lines(lines, first, last, low, high, y):  # type: ignore[no-untyped-def]
     """Writes the rows' scan lines, relative to y, to lines[0]; returns their number."""
     num = np.uintp(0)
@@ -223,7 +223,7 @@ def _place_lines(lines, first, last, low, high, y):  # type: ignore[no-untyped-d
     return num
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _of_row(numbers, row):  # type: ignore[no-untyped-def]
     """The numbers of a row's scan lines; row 0 is the first that has any."""
     at = np.uintp(_NUM_LINES) * row
@@ -231,7 +231,7 @@ def _of_row(numbers, row):  # type: ignore[no-untyped-def]
     return numbers[at], numbers[at + one], numbers[at + two], numbers[at + three]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@inlined
 def _coverage(left, tall, lows, highs):  # type: ignore[no-untyped-def]
     """Fraction of the pixel [left, left + 1] that its scan lines cover from low to high.
 
@@ -244,13 +244,13 @@ def _coverage(left, tall, lows, highs):  # type: ignore[no-untyped-def]
     return min(coverage, 1.0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _part(left, low, high):  # type: ignore[no-untyped-def]
     """Length of [left, left + 1] that lies in [low, high]."""
     return max(0.0, min(left + 1.0, high) - max(left, low))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _disc(view, lines, x, y, radius, intensity):  # type: ignore[no-untyped-def]
     """Renders a disc: exact along x, sampled by scan lines along y.
 
@@ -279,7 +279,7 @@ def _disc(view, lines, x, y, radius, intensity):  # type: ignore[no-untyped-def]
                 view[i, j] = _blend(view[i, j], intensity, coverage)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _bar(view, lines, x, y, dx, dy, start, end, half, intensity):  # type: ignore[no-untyped-def]
     """Renders the rectangle from start to end along (dx, dy) from (x, y), half to either side.
 
@@ -291,7 +291,7 @@ def _bar(view, lines, x, y, dx, dy, start, end, half, intensity):  # type: ignor
         _bar_across(view, lines, x, y, dx, dy, start, end, half, intensity)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _bar_across(view, lines, x, y, dx, dy, start, end, half, intensity):  # type: ignore[no-untyped-def]
     """Renders a _bar with scan lines along the view's rows, for |dy| >= |dx|."""
     size = view.shape[0]

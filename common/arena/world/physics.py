@@ -15,12 +15,12 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
 from mrcdrl.common.arena.world.obstacles import inner_walls, outer_walls, reachable_px
 from mrcdrl.common.arena.world.scene import STRAIGHT
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, Int64Array, UInt8Array
+from mrcdrl.common.runtime.compiled import compiled
 
 
 class Physics(Protocol):
@@ -102,7 +102,7 @@ def check_placed(config: ArenaConfig, robots: Float64Array, obstacles: Float64Ar
         raise ValueError(f"robot {i} at {tuple(robots[i].tolist())} {what[problem - 1]}")
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _first_misplaced(robots, bounds, radius, walls, obstacles):  # type: ignore[no-untyped-def]
     """The first misplaced robot, and why: 1 out of bounds, 2 on something fixed, 3 on a robot."""
     low, high = bounds
@@ -117,7 +117,7 @@ def _first_misplaced(robots, bounds, radius, walls, obstacles):  # type: ignore[
     return 0, 0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _move_all(  # type: ignore[no-untyped-def]
     arenas,
     actions,
@@ -166,7 +166,7 @@ def _move_all(  # type: ignore[no-untyped-def]
                 backs[i] = back_off_frames
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _block(poses, places, radius, beyond, blocked, hits):  # type: ignore[no-untyped-def]
     """Resets places [K, 2] that cannot be taken to the poses, and marks them blocked.
 
@@ -183,7 +183,7 @@ def _block(poses, places, radius, beyond, blocked, hits):  # type: ignore[no-unt
                 blocked[i] = again = True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _meets_robot(i, places, radius):  # type: ignore[no-untyped-def]
     reach = radius + radius
     for j in range(len(places)):
@@ -194,7 +194,7 @@ def _meets_robot(i, places, radius):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _meets_fixed(x, y, radius, walls, obstacles):  # type: ignore[no-untyped-def]
     """Whether the disc overlaps an obstacle, or a wall by its nearest point."""
     for n in range(len(obstacles)):
@@ -213,7 +213,7 @@ def _meets_fixed(x, y, radius, walls, obstacles):  # type: ignore[no-untyped-def
     return False
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _wrapped(angle):  # type: ignore[no-untyped-def]
     """Computes math.remainder(angle, math.tau), which numba lacks; both are exact."""
     rest = np.fmod(angle, math.tau)

@@ -6,11 +6,11 @@ Invariants: pure functions of the scene after the frame; the robots succeed toge
 import math
 
 import numpy as np
-from numba import njit
 
 from mrcdrl.common.arena.world.scene import Scene
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import BoolArray, Float32Array, Float64Array, Int64Array
+from mrcdrl.common.runtime.compiled import compiled
 
 
 def frame_rewards(
@@ -53,7 +53,7 @@ def on_target_px(config: ArenaConfig) -> float:
     return math.sqrt(2 * config.target_size_px**2 + config.robot_radius_px)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _reward_all(  # type: ignore[no-untyped-def]
     robots,
     targets,
@@ -91,7 +91,7 @@ def _reward_all(  # type: ignore[no-untyped-def]
                 rewards[n, i] = step_reward
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _all_on_distinct_targets(distances, delta, failed):  # type: ignore[no-untyped-def]
     """Whether every working robot [K] can be given its own target [M] nearer than delta."""
     num_robots, num_targets = distances.shape
@@ -107,7 +107,7 @@ def _all_on_distinct_targets(distances, delta, failed):  # type: ignore[no-untyp
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _assign(robot, distances, delta, owners, tried):  # type: ignore[no-untyped-def]
     """Gives the robot a target, reassigning owners if that helps (an augmenting path)."""
     for target in range(len(owners)):

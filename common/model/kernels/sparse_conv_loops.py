@@ -14,8 +14,10 @@ from typing import Any, Final
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic as _intrinsic
+
+from mrcdrl.common.runtime.compiled import compiled
 
 KERNEL: Final = 5  # px, with stride 2 and then a max-pool of 2
 CHANNELS: Final = 32
@@ -160,7 +162,7 @@ def _offsets(builder: Any, step: Any) -> list[Any]:
     return [ir.Constant(step.type, 0), right, step, builder.add(step, right)]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def list_nonzero(images, words, ends, columns, intensities):  # type: ignore[no-untyped-def]
     """Whether they all found room; words: the same memory, several pixels a word."""
     num, stack, size, num_words = words.shape
@@ -183,7 +185,7 @@ def list_nonzero(images, words, ends, columns, intensities):  # type: ignore[no-
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def layer(  # type: ignore[no-untyped-def]
     ends, columns, intensities, stack, size, taps, bias, pooled, largest
 ):
@@ -224,7 +226,7 @@ def layer(  # type: ignore[no-untyped-def]
                 )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def differentiate(  # type: ignore[no-untyped-def]
     ends, columns, intensities, size, gradient, pooled, largest, taps, bias
 ):

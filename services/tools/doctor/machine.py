@@ -12,13 +12,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import requires
 from pathlib import Path
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import SharedMemoryError
 from mrcdrl.common.runtime.cores import allowed_cores, cpu_quota
+from mrcdrl.common.runtime.extras import PACKAGES, TRAINING, missing_extras
 from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.runtime.versions import installed
 from mrcdrl.common.transport.shared_memory import SharedBuffer
@@ -38,6 +39,7 @@ def of_this_machine(config: Config, run_dir: Path, *, running: bool) -> Iterator
     running: the run is up, so that its table is already allocated.
     """
     yield python_and_packages(requirements(), pins(CONSTRAINTS))
+    yield extras(missing_extras())
     yield clock()
     yield cores(config, allowed_cores(), cpu_quota(), os.environ)
     yield memory(0 if running else table_bytes(config), free_memory(_CGROUP))
@@ -83,6 +85,20 @@ def python_and_packages(least: Mapping[str, str], tested: Mapping[str, str]) -> 
     torch = have["torch"] or "not installed: no actor, learner or evaluator can run here"
     python = ".".join(map(str, sys.version_info[:3]))
     return ok(check, f"Python {python}, zenoh {have.get('eclipse-zenoh')}, torch {torch}")
+
+
+def extras(missing: Mapping[str, Sequence[str]]) -> Finding:
+    """Say what is not installed; a machine that only serves replay or routes needs none of it.
+
+    missing: packages by extra.
+    """
+    if not missing:
+        return ok("extras", f"all installed: {', '.join(PACKAGES)}")
+    named = "; ".join(f"{extra} (lacks {', '.join(lacks)})" for extra, lacks in missing.items())
+    said = f"not installed: {named}"
+    if set(missing) & set(TRAINING):
+        said += "; to train here: pip install 'mrcdrl[all]'"
+    return ok("extras", said)
 
 
 def _numbers(text: str | None) -> tuple[int, ...]:

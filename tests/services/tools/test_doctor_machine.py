@@ -17,6 +17,7 @@ from mrcdrl.services.tools.doctor.machine import (
     clock,
     cores,
     disk,
+    extras,
     free_memory,
     memory,
     of_this_machine,
@@ -32,7 +33,16 @@ GIB = 1 << 30
 
 def test_this_machine_is_checked_whole(tmp_path: Path) -> None:
     found = list(of_this_machine(SMOKE, tmp_path, running=False))
-    checks = ["versions", "clock", "cores", "memory", "shared memory", "allocator", "disk"]
+    checks = [
+        "versions",
+        "extras",
+        "clock",
+        "cores",
+        "memory",
+        "shared memory",
+        "allocator",
+        "disk",
+    ]
     assert [finding.check for finding in found] == checks
     for finding in found:
         assert finding.said
@@ -65,6 +75,22 @@ def test_the_clock() -> None:
     coarse = mock.Mock(monotonic=True, resolution=0.01)
     with mock.patch("time.get_clock_info", return_value=coarse):
         assert clock().verdict == "warning"
+
+
+@pytest.mark.parametrize(
+    ("missing", "said"),
+    [
+        ({}, "all installed: arena, learn"),
+        ({"certs": ["cryptography"]}, "not installed: certs (lacks cryptography)"),
+        (
+            {"arena": ["cv2", "pymunk"], "learn": ["torch"]},
+            "not installed: arena (lacks cv2, pymunk); learn (lacks torch); to train here: "
+            "pip install 'mrcdrl[all]'",
+        ),
+    ],
+)
+def test_extras_that_are_missing_are_named(missing: dict[str, list[str]], said: str) -> None:
+    assert extras(missing).said.startswith(said)
 
 
 @pytest.mark.parametrize(
