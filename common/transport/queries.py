@@ -2,7 +2,7 @@
 
 Invariants: Zenoh's callbacks only enqueue, or refuse at once; a request is answered once, by a
 reply, a refusal, or "held", which means ask again; no reply becomes a DeadlineError that names the
-peer.
+peer. Of several answers the first that can be read counts; others are counted and told.
 
 A large message between processes of one host goes through a shared buffer (`shared_memory.py`),
 which the wire calls a slot:
@@ -18,6 +18,7 @@ Between peers that are far from each other, large messages are compressed (`comp
 """
 
 import contextlib
+import logging
 import queue
 import re
 import threading
@@ -36,6 +37,7 @@ from mrcdrl.common.errors import (
     WireError,
 )
 from mrcdrl.common.messages.framing import Part
+from mrcdrl.common.runtime.names import printable
 from mrcdrl.common.transport.compression import compressed, expanded
 from mrcdrl.common.transport.shared_memory import (
     LARGE_BYTES,
@@ -46,11 +48,13 @@ from mrcdrl.common.transport.shared_memory import (
     room,
 )
 
+_LOG = logging.getLogger("transport")
 _HELD = "held: "
 _FAR = "far: "
 _KNOWN_FAR = "far"
 _OFFER = re.compile(r"slot (\S+ \d+ \d+ \S+)(?: (\d{1,12}) (\d{1,12}))?")
 _NEAR = re.compile(r"near(?: (\d{1,12}) (\d{1,12}))?")
+_REPLIES = 4  # to one query that are looked at
 _WAITING = 4  # largest messages that may wait for a server
 _LATE_S = 1.0  # added to Zenoh's own timeout of a query, for a late callback
 
@@ -58,10 +62,11 @@ _LATE_S = 1.0  # added to Zenoh's own timeout of a query, for a late callback
 class Request:
     """A query, answered once, by `reply`, `refuse`, `throttle` or `cannot_open`."""
 
-    __slots__ = ("_far", "_memory", "_near", "_query", "arrived_s", "payload")
+    __slots__ = ("_far", "_key", "_memory", "_near", "_query", "arrived_s", "payload")
 
-    def __init__(self, query: Any, payload: Part) -> None:
+    def __init__(self, query: Any, payload: Part, key: str) -> None:
         self._query = query
+        self._key = key  # the server's: the query's may have wildcards
         self._memory: memoryview | None = None  # shared by the client
         self._near: str | None = None  # the reply's attachment
         self._far = False  # the client is far, so it reads compressed messages
@@ -111,7 +116,7 @@ class Request:
             if place is not None:
                 near, parts = f"near {place[0]} {place[1]}", ()
         message = _over_network(parts, far=self._far)
-        self._answer(lambda: self._query.reply(self._query.key_expr, message, attachment=near))
+        self._answer(lambda: self._query.reply(self._key, message, attachment=near))
 
     def refuse(self, reason: str) -> None:
         """Answer that the request is wrong: asking again would not help."""
@@ -133,12 +138,13 @@ class Request:
 
 
 class Server:
-    """Requests in the order of their arrival, for one serving thread.
+    """Requests on a key in the order of their arrival, for one serving thread.
 
     At most `capacity` wait, with no more bytes in all than four messages of the largest size.
     """
 
-    def __init__(self, max_message_bytes: int, capacity: int) -> None:
+    def __init__(self, key: str, max_message_bytes: int, capacity: int) -> None:
+        self._key = key
         self._max_bytes = max_message_bytes
         self._waiting: queue.Queue[tuple[Request, int]] = queue.Queue(capacity)
         self._lock = threading.Lock()
@@ -152,9 +158,10 @@ class Server:
         size = 0 if query.payload is None else len(query.payload)
         if size > self._max_bytes:
             self.refused += 1
-            Request(query, b"").refuse(f"{size} bytes exceed the limit of {self._max_bytes}")
+            refused = Request(query, b"", self._key)
+            refused.refuse(f"{size} bytes exceed the limit of {self._max_bytes}")
             return
-        request = Request(query, query.payload.to_bytes() if size else b"")
+        request = Request(query, query.payload.to_bytes() if size else b"", self._key)
         with self._lock:
             full = self._waiting.full() or self._bytes + size > _WAITING * self._max_bytes
             if not full:
@@ -194,19 +201,24 @@ class PendingReply:
         max_message_bytes: int,
         pool: BufferPool,
         buffer: SharedBuffer | None,
+        another: Callable[[], None],
     ) -> None:
+        """another: called by Zenoh's thread for each reply after the first."""
         self._whom = whom
         self._deadline = time.monotonic() + timeout_s + _LATE_S
         self._max_bytes = max_message_bytes
         self._pool = pool
         self._buffer = buffer
-        self._reply: Any = None
+        self._another = another
+        self._replies: list[Any] = []
         self._ended = threading.Event()
 
     def offer(self, reply: Any) -> None:
         """Zenoh's callback."""
-        if self._reply is None:
-            self._reply = reply
+        if self._replies:
+            self._another()
+        if len(self._replies) < _REPLIES:
+            self._replies.append(reply)
         self._ended.set()
 
     def end(self) -> None:
@@ -219,27 +231,23 @@ class PendingReply:
         return self._ended.wait(max(min(timeout_s, left), 0.0)) or left <= timeout_s
 
     def result(self) -> Part:
-        """The reply's payload, valid until `release`.
+        """The payload of the first reply that can be read, valid until `release`.
 
-        Raises ThrottledError or RefusedError for a refusal, DeadlineError if no reply came,
-        WireError if it is compressed and damaged.
+        Raises ThrottledError or RefusedError for a refusal, DeadlineError if no reply came. If none
+        can be read: WireError if the first is compressed and damaged, RefusedError otherwise.
         """
         self._ended.wait(max(self._deadline - time.monotonic(), 0.0))
-        reply = self._reply
-        if reply is None:
-            raise DeadlineError(f"no answer from {self._whom}")
-        if reply.ok is not None:
-            return self._payload(reply.ok)
-        text = reply.err.payload.to_bytes().decode("utf-8", "replace")
-        if text == "Timeout":
-            raise DeadlineError(f"no answer from {self._whom} in time")
-        self.release()
-        if text.startswith(_FAR):
-            self._pool.refused(text.removeprefix(_FAR))
-            raise ThrottledError(text)
-        if text.startswith(_HELD):
-            raise ThrottledError(text.removeprefix(_HELD))
-        raise RefusedError(f"{self._whom} refused: {text}")
+        unreadable: list[RefusedError | WireError] = []
+        for reply in self._replies:
+            if reply.ok is None:
+                raise self._refusal(_text(reply.err.payload))
+            try:
+                return self._payload(reply.ok)
+            except (RefusedError, WireError) as error:
+                unreadable.append(error)
+        if unreadable:
+            raise unreadable[0]
+        raise DeadlineError(f"no answer from {self._whom}")
 
     def release(self) -> None:
         """Give the buffer back: the result is no longer read.
@@ -250,8 +258,20 @@ class PendingReply:
             self._pool.give_back(self._buffer)
             self._buffer = None
 
+    def _refusal(self, text: str) -> TransportError:
+        """The error that an error reply stands for."""
+        if text == "Timeout":
+            return DeadlineError(f"no answer from {self._whom} in time")
+        self.release()
+        if text.startswith(_FAR):
+            self._pool.refused(text.removeprefix(_FAR))
+            return ThrottledError(text)
+        if text.startswith(_HELD):
+            return ThrottledError(text.removeprefix(_HELD))
+        return RefusedError(f"{self._whom} refused: {text}")
+
     def _payload(self, sample: Any) -> Part:
-        attachment = "" if sample.attachment is None else sample.attachment.to_bytes().decode()
+        attachment = "" if sample.attachment is None else _text(sample.attachment)
         near = _NEAR.fullmatch(attachment)
         if near:
             self._pool.opened()
@@ -280,6 +300,9 @@ class Client:
         self._timeout_s = timeout_s
         self._max_bytes = max_message_bytes
         self._pool = pool
+        self._told = 0
+        self.others = 0
+        """Replies after the first: another process answers on this key."""
 
     def attach(self, querier: Any) -> None:
         """Use this querier of Zenoh's from now on."""
@@ -290,6 +313,7 @@ class Client:
 
         reply_bytes: the expected size of the answer, roughly.
         """
+        self._tell_of_others()
         parts = [payload] if isinstance(payload, Part) else payload
         length = sum(map(len, parts))
         buffer = self._pool.borrow(max(length, reply_bytes))
@@ -300,11 +324,28 @@ class Client:
                 place = put(buffer.memory, parts)
                 if place is not None:
                     attachment, parts = f"{attachment} {place[0]} {place[1]}", ()
-        pending = PendingReply(self._whom, self._timeout_s, self._max_bytes, self._pool, buffer)
+        pending = PendingReply(
+            self._whom, self._timeout_s, self._max_bytes, self._pool, buffer, self._another
+        )
         handler = zenoh.handlers.Callback(pending.offer, pending.end, indirect=False)
         message = _over_network(parts, far=self._pool.near is False)
         self._get(handler, message, attachment)
         return pending
+
+    def _another(self) -> None:
+        self.others += 1
+
+    def _tell_of_others(self) -> None:
+        """Log that others answer, too: the first time, and whenever there are twice as many."""
+        others = self.others
+        if others >= max(1, 2 * self._told):
+            self._told = others
+            _LOG.warning(
+                "another process answers for %s, too (%d answers so far); the first one counts: "
+                "look for a second one under this run's name",
+                self._whom,
+                others,
+            )
 
     def _get(self, handler: Any, message: bytes, attachment: str | None) -> None:
         querier = self._querier
@@ -321,6 +362,11 @@ def _over_network(parts: Sequence[Part], *, far: bool) -> bytes:
     if far and sum(map(len, parts)) >= LARGE_BYTES:
         return compressed(parts)
     return b"".join(parts)
+
+
+def _text(payload: Any) -> str:
+    """What a peer says in words, fit for a log."""
+    return printable(payload.to_bytes().decode("utf-8", "replace"))
 
 
 def _within(memory: memoryview, start: int, length: int, max_bytes: int) -> memoryview:

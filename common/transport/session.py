@@ -187,7 +187,7 @@ class Session(Closing):
 
     def server(self, key: str, capacity: int = 256) -> Server:
         """Server of queries on `key`; while `capacity` wait, it throttles new ones."""
-        server = Server(self._config.max_message_bytes, capacity)
+        server = Server(key, self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(server.offer, indirect=False)
         self._declare(lambda on: on.declare_queryable(key, handler, complete=True))
         return server

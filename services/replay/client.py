@@ -58,14 +58,17 @@ class ReplayWriter:
         shard: int = 0,
         num_shards: int = 1,
     ) -> None:
-        name = _names(num_shards)[shard]
-        self._client = session.client(keys.insert(shard), name, shared_memory=True)
+        self._name = _names(num_shards)[shard]
+        self._client = session.client(keys.insert(shard), self._name, shared_memory=True)
         self._patience = _Patience("replay has not acknowledged a chunk", warn_s)
         self._stop = stop
         self.throttled = 0
         """Answers that said "not now"."""
         self.unanswered = 0
         """Requests that timed out or brought an unreadable reply."""
+        self.uncounted = 0
+        """Acknowledgements of transitions that replay's own count does not have."""
+        self._inserts: int | None = None  # replay's count in its last acknowledgement
 
     @classmethod
     def from_config(
@@ -97,6 +100,7 @@ class ReplayWriter:
                     return None
                 reply = decode(InsertReply, pending.result())
                 pending.release()
+                self._check_count(chunks[-1], reply)
                 return reply
             except ThrottledError:
                 self.throttled += 1
@@ -110,6 +114,26 @@ class ReplayWriter:
                 self._stop.wait(_RETRY_S)
             if self._stop.is_set():
                 return None
+
+    def _check_count(self, last: Chunk, reply: InsertReply) -> None:
+        """Compare what was acknowledged with replay's count, which only rises, by as much.
+
+        Log the 1st, 2nd, 4th, 8th … that is missing.
+        """
+        before, self._inserts = self._inserts, reply.inserts
+        stored = 0 if reply.duplicate else len(last)
+        if before is None or reply.inserts >= before + stored:
+            return
+        self.uncounted += 1
+        if self.uncounted.bit_count() == 1:
+            _LOG.warning(
+                "%s acknowledged %d transitions, but counts %d where it had %d: it has lost its "
+                "log, or another process answers in its place and stores nothing",
+                self._name,
+                stored,
+                reply.inserts,
+                before,
+            )
 
 
 class ReplayReader:

@@ -1,5 +1,6 @@
 """Real Zenoh sessions on loopback: every wait ends, every queue behaves as stated when full."""
 
+import logging
 import socket
 import threading
 import time
@@ -17,11 +18,21 @@ from mrcdrl.common.errors import (
     EndpointError,
     RefusedError,
     ThrottledError,
+    WireError,
 )
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.weights import WeightsReader, WeightsWriter
-from mrcdrl.common.transport import ROUTER_FILE, Client, Publisher, Server, Session, free_endpoint
+from mrcdrl.common.transport import (
+    ROUTER_FILE,
+    Client,
+    PendingReply,
+    Publisher,
+    Request,
+    Server,
+    Session,
+    free_endpoint,
+)
 from mrcdrl.common.transport.keys import Keys
 
 _DEADLINE_S = 20.0
@@ -194,6 +205,96 @@ def test_an_answer_that_is_too_large_is_refused(small_network: Network) -> None:
         other.submit(answer_next, server, "reply", "x" * 1001)
         with pytest.raises(RefusedError, match="the answer of the peer exceeds 1000 bytes"):
             client.ask(b"").result()
+
+
+def asked_of_two(network: Network) -> tuple[Client, PendingReply, Request, Request]:
+    """A client, its request to two servers of one key, and the request as each has it.
+
+    The servers call themselves incomplete, so that Zenoh asks both wherever they are. It also asks
+    a complete one in the router beside a complete one elsewhere.
+    """
+    servers = Server(KEY, 1 << 20, 256), Server(KEY, 1 << 20, 256)
+    session = network.join()
+    for server in servers:
+        handler = zenoh.handlers.Callback(server.offer, indirect=False)
+        network.join()._session.declare_queryable(KEY, handler)
+        until_served(session, KEY, server)
+    while servers[0].take(0.1) is not None:  # what `until_served` asked
+        pass
+    client = session.client(KEY, "the peer")
+    pending = client.ask(b"")
+    one, other = (server.take(_DEADLINE_S) for server in servers)
+    assert one is not None
+    assert other is not None
+    return client, pending, one, other
+
+
+def test_of_two_answers_the_first_counts_and_the_other_is_told(
+    network: Network, caplog: pytest.LogCaptureFixture
+) -> None:
+    client, pending, one, other = asked_of_two(network)
+    one.reply(b"one")
+    assert pending.result() == b"one"
+    assert client.others == 0
+    other.reply(b"other")
+    eventually(lambda: client.others == 1)
+    assert pending.result() == b"one"
+    with caplog.at_level(logging.WARNING, "transport"):
+        for _ in range(3):
+            client.ask(b"")
+    assert len(caplog.messages) == 1
+    assert "another process answers for the peer, too (1 answers so far)" in caplog.text
+
+
+def test_an_answer_that_cannot_be_read_does_not_hide_one_that_can(network: Network) -> None:
+    client, pending, one, other = asked_of_two(network)
+    one.reply(b"\xc1lz4" + bytes(8))
+    with pytest.raises(WireError):
+        pending.result()
+    other.reply(b"other")
+    eventually(lambda: client.others == 1)
+    assert pending.result() == b"other"
+
+
+def test_a_reply_carries_the_servers_own_key(network: Network) -> None:
+    server, _ = network.pair()
+    session = network.join()
+    replies = session._session.get(KEY.replace("test", "*"))
+    answer_next(server, "reply", "mine")
+    assert [str(reply.ok.key_expr) for reply in replies] == [KEY]
+
+
+def test_what_a_peer_says_in_words_is_printable_and_bounded(network: Network) -> None:
+    server, client = network.pair()
+    for text in ("\x1b[2J\r\nfine\x9b", "held: \x1b[31m", "far: \x07", "x" * 10**6):
+        with ThreadPoolExecutor(1) as asking:
+            answer = asking.submit(lambda: client.ask(b"").result())
+            answer_next(server, "refuse", text)
+            with pytest.raises(RefusedError) as refused:
+                answer.result()
+        assert str(refused.value).isprintable()
+        assert len(str(refused.value)) < 400
+
+
+def test_an_attachment_that_is_no_text_disturbs_nobody(network: Network) -> None:
+    session, key = network.join(), f"{KEY}/odd"
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(key, b"whole", attachment=b"\xff\x1b\xfe")
+        query.drop()
+
+    handler = zenoh.handlers.Callback(answer, indirect=False)
+    queryable = session._session.declare_queryable(key, handler, complete=True)
+    client = network.join().client(key, "the peer")
+    eventually(lambda: answers(client, b"whole"))
+    queryable.undeclare()
+
+
+def answers(client: Client, payload: bytes) -> bool:
+    try:
+        return client.ask(b"").result() == payload
+    except DeadlineError:
+        return False
 
 
 def test_a_full_server_throttles_further_requests(network: Network) -> None:

@@ -1,5 +1,9 @@
 """The writer's patience with a replay service at which too many requests are waiting."""
 
+import itertools
+import logging
+from collections.abc import Sequence
+
 import pytest
 
 from mrcdrl.common.errors import ThrottledError
@@ -9,14 +13,15 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.replay import client
 from mrcdrl.services.replay.client import ReplayWriter
-from tests.services.replay.harness import make_chunk
+from tests.services.replay.harness import LENGTH, make_chunk
 
 
 class FakeReplay:
     """Session, client and answer in one: throttles some requests at once, then acknowledges."""
 
-    def __init__(self, throttles: int) -> None:
+    def __init__(self, throttles: int, replies: Sequence[InsertReply] = ()) -> None:
         self.throttles = throttles
+        self.replies = iter(replies or itertools.repeat(InsertReply(0, False, 3)))
 
     def client(self, *_: object, **__: object) -> "FakeReplay":
         return self
@@ -31,7 +36,7 @@ class FakeReplay:
         self.throttles -= 1
         if self.throttles >= 0:
             raise ThrottledError("256 requests are waiting")
-        return encode(InsertReply(0, False, 3))
+        return encode(next(self.replies))
 
     def release(self) -> None:
         pass
@@ -72,3 +77,30 @@ def test_a_writer_throttled_after_a_wait_asks_again_at_once(
     stop = Waits()
     assert insert(3, stop).throttled == 3
     assert stop.seconds == []
+
+
+@pytest.mark.parametrize(
+    ("replies", "uncounted"),
+    [
+        ([(LENGTH, False), (2 * LENGTH, False), (3 * LENGTH, False)], 0),
+        ([(5 * LENGTH, False), (9 * LENGTH, False), (10 * LENGTH, False)], 0),  # of several actors
+        ([(5 * LENGTH, True), (5 * LENGTH, True), (6 * LENGTH, False)], 0),  # repeated
+        ([(5 * LENGTH, False), (5 * LENGTH, False), (6 * LENGTH, False)], 1),
+        ([(5 * LENGTH, False), (0, False), (6 * LENGTH, False)], 1),
+        ([(5 * LENGTH, False), (2**50, False), (6 * LENGTH, False)], 1),
+        ([(0, False)] * 9, 8),
+    ],
+)
+def test_an_acknowledgement_that_replay_does_not_count_is_told(
+    replies: list[tuple[int, bool]], uncounted: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of a process that acknowledges in replay's place, and stores nothing."""
+    told = [InsertReply(0, duplicate, inserts) for inserts, duplicate in replies]
+    session = FakeReplay(0, told)
+    writer = ReplayWriter(session, Keys("run"), 10.0, Waits())  # type: ignore[arg-type]
+    with caplog.at_level(logging.WARNING, "replay-client"):
+        for number in range(len(replies)):
+            assert writer.insert([make_chunk(number)]) is not None
+    assert writer.uncounted == uncounted
+    assert len(caplog.messages) == uncounted.bit_length()
+    assert ("another process answers in its place" in caplog.text) == bool(uncounted)
