@@ -72,6 +72,8 @@ ODD: list[tuple[Any, dict[str, Any], str]] = [
         for value in (NAN, -INF, 1e300)
     ],
     (LEARNER, {"metrics": {"step_share": NAN}}, "metric step_share"),
+    (LEARNER, {"metrics": {"of_nobody": NAN}}, "metric of_nobody"),
+    (LEARNER, {"role": "foreign", "metrics": {"slot": NAN}}, "metric slot"),
     (LEARNER, {"metrics": {"x" * 65: 1.0}}, "is not a name"),
     (LEARNER, {"metrics": {ESCAPE: 1.0}}, r"called '\\\\x1b\[31m', which is not a name"),
     (LEARNER, {"metrics": {"": 1.0}}, "is not a name"),
@@ -122,7 +124,7 @@ def test_an_unknown_field_is_named_in_printable_text() -> None:
 
 
 def test_what_shows_that_learning_diverges_may_be_no_number() -> None:
-    metrics = {"loss": NAN, "q_max": INF, "mean_q": -INF, "of_a_foreign_peer": NAN}
+    metrics = {"loss": NAN, "q_max": INF, "mean_q": -INF}
     found = decode(Stats, changed(LEARNER, metrics=metrics))
     assert found.metrics.keys() == metrics.keys()
     decode(EpisodeSummary, changed(EPISODE, mean_q=NAN))

@@ -164,7 +164,7 @@ MESSAGES = st.one_of(
         Stats,
         role=NAMES,
         id=NAMES,
-        metrics=st.dictionaries(NAMES, st.floats(allow_nan=False), max_size=5),
+        metrics=st.dictionaries(NAMES, NUMBERS, max_size=5),
         text=st.dictionaries(NAMES, TEXTS, max_size=5),
     ),
 )
