@@ -31,7 +31,7 @@ def record_bytes(arena: dict[str, Any]) -> int:
 
 
 def render(record: bytes, arena: dict[str, Any]) -> np.ndarray:
-    """The image, uint8 [V, V], of a record of codec `scene` without noise."""
+    """The image, uint8 [V, V], of a record of codec `scene`."""
     robots, targets, obstacles = counts(arena)
     numbers = np.frombuffer(record, "<f4").astype(float)
     own, others = numbers[:3], numbers[: 3 * robots].reshape(-1, 3)
@@ -59,7 +59,25 @@ def render(record: bytes, arena: dict[str, Any]) -> np.ndarray:
         along = np.array([np.cos(heading), np.sin(heading)])
         start, end = (x, y) - HEADING_CAP * along, (x, y) + (radius + HEADING_CAP) * along
         view.bar(start, end, HEADING_HALF, HEADING)
+    if arena["pixel_noise"] > 0:
+        return noisy(view.image, np.frombuffer(record, "<u4")[-1:], arena["pixel_noise"])
     return view.image
+
+
+def noisy(image: np.ndarray, seed: np.ndarray, deviation: float) -> np.ndarray:
+    """The image with the noise of a seed, uint32 [1]."""
+    step = np.uint64(0x9E3779B97F4A7C15)
+    states = mixed(seed * step) + step * np.arange(1, image.size + 1, dtype=np.uint64)
+    parts = mixed(states).view("<u2").reshape(*image.shape, 4)
+    offsets = (parts.sum(axis=2, dtype=float) - 131_070) * deviation / np.sqrt((65_536**2 - 1) / 3)
+    return np.clip(image + offsets + 0.5, 0, 255).astype(np.uint8)
+
+
+def mixed(z: np.ndarray) -> np.ndarray:
+    """Splitmix64's mixture of 64-bit numbers."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
 
 
 class View:
