@@ -16,10 +16,12 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
+import torch
 
 from mrcdrl import cli
 from mrcdrl.common.arena.controllers import CONTROLLERS
 from mrcdrl.common.config import Config, TransportConfig, preset_names
+from mrcdrl.common.messages.checks import RANGES
 from mrcdrl.common.messages.metrics import SCHEMAS, kinds
 from mrcdrl.common.messages.trajectory import (
     Chunk,
@@ -186,13 +188,34 @@ def test_key_is_documented(key: str) -> None:
     assert shown in names(part(page("wire.md"), "## Keys"))
 
 
-def test_example_subscriber_runs(tmp_path: Path) -> None:
+def number(value: float) -> str:
+    """A limit as docs/wire.md writes it."""
+    sign, size = "−" if value < 0 else "", abs(value)
+    return sign + {2**53: "2^53", 2**63: "2^63"}.get(int(size), f"{size:g}")
+
+
+def test_ranges_that_a_receiver_checks_are_documented() -> None:
+    documented = {
+        (row[0].strip("`"), field): row[2].removesuffix(" |")
+        for row in rows(part(page("wire.md"), "## What a receiver checks"))
+        for field in code(row[1])
+    }
+    checked = {
+        (message.__name__, field): f"{number(low)} … {number(high)}"
+        for message, ranges in RANGES.items()
+        for field, (low, high) in ranges.items()
+    }
+    assert documented == checked
+
+
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16, torch.float16], ids=str)
+def test_example_subscriber_runs(precision: torch.dtype, tmp_path: Path) -> None:
     example = tmp_path / "watch.py"
     found = re.search(r"```python\n(.*?)```", page("wire.md"), re.S)
     assert found
     example.write_text(found[1], "utf-8")
     endpoint, keys = free_endpoint(), Keys("documented")
-    weights = Weights.of(7, 3, 100, weights_to_bytes(QNetwork("dqn")))
+    weights = Weights.of(7, 3, 100, weights_to_bytes(QNetwork("dqn"), precision))
     test = Evaluation("e", 7, 3, 100, 2, 10, 0.5, 0.5, 0, (0.2, 0.8), 5, 5, 0, 9, 1, 0, 1)
     with Session(TransportConfig(listen=(endpoint,))) as session:
         process = subprocess.Popen(
