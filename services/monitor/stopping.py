@@ -10,6 +10,18 @@ from mrcdrl.common.config import RunConfig
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW
 
+_STOPPED = "stopped ("
+
+
+def stopped(cause: str) -> str:
+    """Reason of a run that a signal ended; it would have gone on."""
+    return f"{_STOPPED}{cause})"
+
+
+def was_stopped(reason: str) -> bool:
+    """Whether a signal ended the run, and not its own rule."""
+    return reason.startswith(_STOPPED)
+
 
 class StoppingRule:
     """Observes episodes and evaluations, and says why the run is over.

@@ -22,7 +22,7 @@ from mrcdrl.services.monitor.records import finite
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.screen import Screen
 from mrcdrl.services.monitor.state import RunState
-from mrcdrl.services.monitor.stopping import StoppingRule
+from mrcdrl.services.monitor.stopping import StoppingRule, stopped
 
 _TICK_S = 0.25
 _LISTEN_S = 3.0  # every service reports once a second, and two reports make a rate
@@ -61,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
         with showing as show:
             listen(follower, heartbeat, stop, show)
         if recorder is not None:
-            recorder.write_summary(state, follower.now, f"stopped ({stop.cause})")
+            recorder.write_summary(state, follower.now, stopped(stop.cause))
     return 0
 
 

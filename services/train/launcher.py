@@ -25,7 +25,7 @@ from mrcdrl.services.monitor.follower import Follower
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
 from mrcdrl.services.monitor.state import RunState
-from mrcdrl.services.monitor.stopping import StoppingRule
+from mrcdrl.services.monitor.stopping import StoppingRule, stopped
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.resuming import check_unfinished
 
@@ -113,7 +113,7 @@ def supervise(run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSig
                 show()
                 reason = fleet.watch() or follower.stop_reason()
                 if stop.is_set():
-                    reason = f"stopped ({stop.cause})"
+                    reason = stopped(stop.cause)
         if stop.is_set():
             _LOG.info("stopping (%s) …", stop.cause)
         else:

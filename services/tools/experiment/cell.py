@@ -28,6 +28,7 @@ from mrcdrl.services.monitor.records import (
     read_last_metrics,
     to_line,
 )
+from mrcdrl.services.monitor.stopping import was_stopped
 from mrcdrl.services.tools.experiment.grid import BEST, PROTOCOL, Cell
 
 RATES = (0.5, 0.8, 0.9, 0.93, 0.94)
@@ -109,7 +110,7 @@ class CellFiles:
     @property
     def trained(self) -> bool:
         """Whether the training came to its own end, and was not stopped by a signal."""
-        return bool(self.summary) and not self.summary["stop_reason"].startswith("stopped (")
+        return bool(self.summary) and not was_stopped(self.summary["stop_reason"])
 
     def train(self) -> list[str]:
         """Arguments of `mrcdrl train`, for a new run or to go on."""

@@ -15,6 +15,7 @@ from mrcdrl.common.config import Config
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Evaluation
 from mrcdrl.services.monitor.records import EvaluationRecord, record_line
+from mrcdrl.services.monitor.stopping import stopped
 from mrcdrl.services.tools.experiment import grid as grid_module
 from mrcdrl.services.tools.experiment import main as main_module
 from mrcdrl.services.tools.experiment import runner
@@ -248,7 +249,7 @@ def test_a_failed_cell_is_named_and_tried_again_and_the_others_go_on(
 
 
 def test_a_training_that_was_stopped_is_not_done(bench: Bench) -> None:
-    (bench.folder / "reason").write_text("stopped (SIGTERM)")
+    (bench.folder / "reason").write_text(stopped("SIGTERM"))
     only = ("--only", "plain-2robots-seed0-*")
     assert bench.run(*only) == 1
     assert bench.cells()[0].failure == "training did not come to its end: stopped (SIGTERM)"
