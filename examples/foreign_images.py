@@ -1,7 +1,7 @@
 """Images from records of codec `scene`, and the network's values: docs/wire.md, in numpy alone.
 
 Nothing of this project is imported, so that it can be read as the protocol's second implementation.
-It is slow, and draws what `renderer = "analytic"` draws.
+It is slow, and renders as `renderer = "analytic"` does.
 """
 
 import io

@@ -1,4 +1,4 @@
-"""The example that draws and computes by docs/wire.md alone gives what our processes give."""
+"""The example that renders and computes by docs/wire.md alone gives what our processes give."""
 
 import importlib.util
 import json
