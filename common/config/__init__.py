@@ -1,5 +1,6 @@
 """The configuration of a run: its schema, its sources, and its TOML form."""
 
+from mrcdrl.common.config.kept import refuse_changes
 from mrcdrl.common.config.load import (
     DEFAULT_PRESET,
     apply_overrides,
@@ -39,6 +40,7 @@ __all__ = [
     "load_config",
     "load_transport",
     "preset_names",
+    "refuse_changes",
     "resolved_environment",
     "sections",
     "to_toml",

@@ -64,7 +64,7 @@ class ArenaConfig(Section):
     """c_r. (paper)"""
     target_size_px: Positive = 30
     """s_w = s_h, sides of a square target. (paper)"""
-    turn_deg: Annotated[float, Field(gt=0, lt=180)] = 23
+    turn_deg: Annotated[float, Field(ge=0.1, lt=180)] = 23
     """Angle that a `left` or `right` action turns. (paper)"""
     step_px: Positive = 2.5
     """Distance that every action moves, after its turn. (paper; ancestor: a turn moves too)"""
@@ -154,6 +154,11 @@ class ArenaConfig(Section):
         if inner < 2 * self.robot_radius_px:
             raise ValueError(
                 f"no robot of radius {self.robot_radius_px} px fits inside walls {inner} px apart"
+            )
+        if self.target_size_px > self.size_px:
+            raise ValueError(
+                f"target_size_px {self.target_size_px:g} exceeds size_px {self.size_px}: a target "
+                "would cover the arena"
             )
         if self.target_count < self.num_robots:
             raise ValueError(

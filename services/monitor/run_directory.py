@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from mrcdrl.common.config import Config, kept_settings, load_config, to_toml, variable
+from mrcdrl.common.config import Config, load_config, refuse_changes, to_toml
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, reason
@@ -28,18 +28,6 @@ def default_name(config_name: str, num_robots: int) -> str:
     """A name such as quick-2robots-20261122-101500."""
     stem = Path(config_name).stem
     return f"{stem}-{num_robots}robots-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def refuse_changes(path: Path, before: Config, now: Config) -> None:
-    """Raise RunDirectoryError if a setting differs that the run's weights or records depend on."""
-    lockstep = bool(before.run.turn_size)
-    for section, name in kept_settings(lockstep=lockstep):
-        old, new = (getattr(getattr(config, section), name) for config in (before, now))
-        if old != new:
-            raise RunDirectoryError(
-                f"{section}.{name} is {new} here and {old} in {path}, whose weights or transitions "
-                f"need it; leave out its flag or {variable(section, name)}, or start a new run"
-            )
 
 
 class RunDirectory(Closing):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from mrcdrl.common.config import Config, TransportConfig, load_config
+from mrcdrl.common.config import Config, TransportConfig, load_config, refuse_changes
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.common.runtime.names import check_name
@@ -28,7 +28,8 @@ class Serving:
     def from_argv(cls, argv: Sequence[str]) -> Self:
         """Parse the command line.
 
-        Raises EndpointError if the flags, the configuration and the run directory name no endpoint.
+        Raises EndpointError if the flags, the configuration and the run directory name no endpoint,
+        RunDirectoryError if they change what the records in that directory depend on.
         """
         parser = Parser(prog="mrcdrl replay", description="Serve the replay table of a run.")
         parser.add_argument("--run", required=True, help="the run's name")
@@ -45,7 +46,10 @@ class Serving:
         add_config_flags(parser)
         arguments = parser.parse_args(argv)
         run_dir = arguments.run_dir / check_name(arguments.run, "run name")
-        config = load_config(arguments.config or _config_of(run_dir), overrides(arguments))
+        own = _config_of(run_dir)
+        config = load_config(arguments.config or own, overrides(arguments))
+        if own is not None:
+            refuse_changes(run_dir, load_config(own, environ={}), config)
         listen, connect = tuple(arguments.listen or ()), tuple(arguments.connect or ())
         if not (listen or connect):
             listen, connect = config.transport.listen, config.transport.connect

@@ -161,7 +161,10 @@ def test_a_broken_file_below_is_named(write: Any) -> None:
 IMPOSSIBLE = {
     "value too large": ({"arena.num_robots": "11"}, "robots: must be between 1 and 10 .given 11."),
     "value too small": ({"arena.num_robots": "0"}, "robots: must be between 1 and 10 .given 0."),
-    "value at an open limit": ({"arena.turn_deg": "180"}, "deg: must be above 0 and below 180 "),
+    "value at an open limit": (
+        {"arena.turn_deg": "180"},
+        "deg: must be at least 0.1 and below 180 ",
+    ),
     "value without an upper limit": ({"run.actors": "-1"}, "run.actors: must be at least 0 "),
     "no such choice": ({"agent.kind": "duell"}, "agent.kind: must be 'duel', 'ddqn' or 'dqn' "),
     "not a number": ({"agent.gamma": "nan"}, "agent.gamma: must be a finite number .given nan"),
@@ -194,6 +197,11 @@ IMPOSSIBLE = {
         r"schedule\.0\.1: must be a number .given 'x'",
     ),
     "robots as wide as the arena": ({"arena.robot_radius_px": "300"}, "no robot of radius 300"),
+    "a target as wide as the arena": (
+        {"arena.target_size_px": "601"},
+        "target_size_px 601 exceeds",
+    ),
+    "turns too small to count": ({"arena.turn_deg": "1e-9"}, "must be at least 0.1 and below 180"),
     "a target too few": ({"arena.targets_px": "[[1, 2]]"}, "1 targets for 2 robots; give 2, one a"),
     "an obstacle without size": ({"arena.obstacles_px": "[[1, 2, 0]]"}, "radius that is not above"),
     "an inner wall without length": (
