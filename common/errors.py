@@ -8,6 +8,7 @@ MrcdrlError
 ├── WireError           bytes from a peer break the wire's schema (counted and dropped)
 └── TransportError      the network failed to do what was asked
     ├── EndpointError   an endpoint cannot be listened on or connected to
+    │   └── UnreachableError  nobody answers there, or no run is up to name one
     ├── DeadlineError   a wait timed out; the message names the peer
     ├── SharedMemoryError  a peer's shared buffer is out of reach; the network serves instead
     └── RefusedError    the peer refused, and gave its reason
@@ -49,6 +50,10 @@ class TransportError(MrcdrlError):
 
 class EndpointError(TransportError):
     """An endpoint cannot be listened on or connected to."""
+
+
+class UnreachableError(EndpointError):
+    """Nobody answers at an endpoint, or no run is up that would name one."""
 
 
 class DeadlineError(TransportError):

@@ -1,11 +1,14 @@
 """The shell that all commands share: signals, logging, and a clean exit.
 
-Invariants: SIGTERM and SIGINT set one StopSignal; errors raised on purpose end the process with one
-line and their exit code; bugs crash with a traceback.
+Invariants: SIGTERM, SIGINT and SIGHUP set one StopSignal; errors raised on purpose end the process
+with one line and their exit code; bugs crash with a traceback. Output that nobody reads any more,
+or characters that the locale lacks, are no bugs.
 """
 
 import contextlib
 import ctypes
+import errno
+import io
 import logging
 import os
 import signal
@@ -15,6 +18,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
+from typing import TextIO
 
 from mrcdrl.common.errors import MrcdrlError
 
@@ -29,6 +33,7 @@ ALLOCATOR = {
 STOP_DEADLINE_S = 30  # for a service, from the signal to its exit
 # Starts a command in its own process. -P: nothing is imported from the current directory.
 COMMAND = (sys.executable, "-P", "-m", "mrcdrl")
+CLOSED_PIPE = 128 + signal.SIGPIPE  # exit code, as a shell reports a process that SIGPIPE ended
 _PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -42,7 +47,9 @@ class StopSignal:
         self._deadline_s = 0
 
     def listen(self, deadline_s: int = 0) -> "StopSignal":
-        """Have SIGTERM and SIGINT set it; call from the main thread.
+        """Have SIGTERM, SIGINT and SIGHUP set it; call from the main thread.
+
+        A SIGHUP that is ignored stays ignored: nohup starts what outlives its terminal.
 
         deadline_s: if above 0, the kernel ends a process that still runs this long after the
         signal, whatever it waits for.
@@ -50,6 +57,8 @@ class StopSignal:
         self._deadline_s = deadline_s
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            signal.signal(signal.SIGHUP, self._on_signal)
         return self
 
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
@@ -69,7 +78,11 @@ class StopSignal:
 
 
 def run_main(main: Callable[[], int | None]) -> int:
-    """Run a command and return its exit code; a MrcdrlError becomes one line on stderr."""
+    """Run a command and return its exit code; a MrcdrlError becomes one line on stderr.
+
+    A command whose output nobody reads any more ends with CLOSED_PIPE and without a word.
+    """
+    _open_output()
     logging.basicConfig(level=logging.INFO, format=_LOG_FORMAT, stream=sys.stderr)
     parent = os.environ.get(DIE_WITH_PARENT)
     if parent and sys.platform == "linux":
@@ -77,13 +90,66 @@ def run_main(main: Callable[[], int | None]) -> int:
         if os.getppid() != int(parent):  # it ended before the line above
             return 0
     try:
-        return main() or 0
+        return _exit_code(main)
+    finally:
+        _close_output()
+
+
+def _exit_code(main: Callable[[], int | None]) -> int:
+    try:
+        try:
+            return main() or 0
+        finally:
+            sys.stdout.flush()
     except MrcdrlError as error:
-        sys.stderr.write(f"mrcdrl: {error}\n")
+        _say(str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        sys.stderr.write("mrcdrl: interrupted\n")
+        _say("interrupted")
         return 130
+    except SystemExit as end:  # of rich, which takes a closed pipe for the end of the process
+        if isinstance(end.__context__, BrokenPipeError):
+            return CLOSED_PIPE
+        raise
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            _say(str(error))
+            return 1
+        if isinstance(error, BrokenPipeError):
+            return CLOSED_PIPE
+        raise
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"mrcdrl: {line}\n")
+
+
+def _open_output() -> None:
+    """Have stdout and stderr take every character in any locale, and nowhere if they are closed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _close_output() -> None:
+    """Flush stdout and stderr; drop what cannot be written, which the interpreter would report."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            discard(stream)
+
+
+def discard(stream: TextIO) -> None:
+    """Drop what is written to the stream from now on, and what waits in it."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    with contextlib.suppress(io.UnsupportedOperation):  # a stream without a file
+        os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def start_service(

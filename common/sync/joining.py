@@ -13,8 +13,8 @@ from typing import Self
 
 from mrcdrl.common.config import Config, TransportConfig, apply_overrides, load_transport
 from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transport_flag, overrides
-from mrcdrl.common.errors import DeadlineError, EndpointError
-from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.errors import DeadlineError, UnreachableError, WireError
+from mrcdrl.common.runtime.names import check_name, printable
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
@@ -34,7 +34,7 @@ class Joining:
 
     @classmethod
     def from_argv(cls, role: str, argv: Sequence[str]) -> Self:
-        """Parse a service's command line; raises EndpointError as `from_arguments`."""
+        """Parse a service's command line; raises UnreachableError as `from_arguments`."""
         parser = joining_parser(role, f"Start the {role} of a run that is up.")
         return cls.from_arguments(parser.parse_args(argv))
 
@@ -42,7 +42,7 @@ class Joining:
     def from_arguments(cls, arguments: argparse.Namespace) -> Self:
         """Read the flags of `joining_parser`.
 
-        Raises EndpointError if neither --connect nor the run directory names an endpoint.
+        Raises UnreachableError if neither --connect nor the run directory names an endpoint.
         """
         run_dir = arguments.run_dir / check_name(arguments.run, "run name")
         host_and_process = f"{socket.gethostname()}-{os.getpid()}"
@@ -74,12 +74,12 @@ def joining_parser(command: str, description: str) -> Parser:
 def recorded_endpoint(run_dir: Path, flag: str) -> str:
     """The endpoint of a run on this machine, as `mrcdrl train` recorded it.
 
-    Raises EndpointError, naming the flag to give, if no run is up there.
+    Raises UnreachableError, naming the flag to give, if no run is up there.
     """
     try:
         return (run_dir / ENDPOINT_FILE).read_text("utf-8").strip()
     except OSError as error:
-        raise EndpointError(
+        raise UnreachableError(
             f"no run is up in {run_dir}; give {flag}, such as tcp/127.0.0.1:7447"
         ) from error
 
@@ -89,17 +89,22 @@ def fetch_config(
 ) -> Config:
     """Ask replay for the run's configuration, and put this process's own settings over it.
 
-    Raises DeadlineError if nobody serves that run within the time.
+    Raises DeadlineError if nobody serves that run within the time, WireError if what is served is
+    no configuration.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)
     deadline = time.monotonic() + timeout_s
     while True:
         try:
-            text = bytes(client.ask(b"").result()).decode()
+            answer = bytes(client.ask(b"").result())
         except DeadlineError as error:
             if time.monotonic() > deadline or stop.wait(0.2):
                 raise DeadlineError(f"{error}; is that the run's name?") from error
             continue
-        table = {**tomllib.loads(text), "transport": joining.transport.model_dump()}
+        try:
+            served = tomllib.loads(answer.decode())
+        except ValueError as error:  # neither UTF-8 nor TOML
+            raise WireError(f"{whom} serves no configuration: {printable(str(error))}") from error
+        table = {**served, "transport": joining.transport.model_dump()}
         return apply_overrides(table, joining.overrides)

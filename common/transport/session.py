@@ -22,7 +22,7 @@ from typing import Any
 import zenoh
 
 from mrcdrl.common.config import TransportConfig
-from mrcdrl.common.errors import ConfigError, EndpointError
+from mrcdrl.common.errors import ConfigError, EndpointError, UnreachableError
 from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.transport.publications import (
     LatestSubscriber,
@@ -36,6 +36,7 @@ from mrcdrl.common.transport.shared_memory import BufferPool
 ROUTER_FILE = Path(str(resources.files("mrcdrl.configs"))) / "router.json5"
 _LOG = logging.getLogger("transport")
 _RETRY_S = 0.2
+_ZENOH_FILE = re.compile(r"\.? at /")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _ENCRYPTED = "tls/"
 _PORT_0 = re.compile(r"[^?#]*:0+(?![^?#])")
@@ -245,7 +246,7 @@ class Session(Closing):
                     ) from error
                 if time.monotonic() > deadline:
                     refused = ", or does not accept this certificate" * bool(self._config.key)
-                    raise EndpointError(
+                    raise UnreachableError(
                         f"nobody answers at {', '.join(self._connect)}{refused}; is the run up? "
                         f"({_first_line(error)})"
                     ) from error
@@ -277,7 +278,8 @@ def free_endpoint() -> str:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0][:120]
+    """What Zenoh says, without the file of its own that it names."""
+    return _ZENOH_FILE.split(str(error).splitlines()[0])[0][:120]
 
 
 def _endpoints(settings: zenoh.Config, side: str) -> tuple[str, ...]:

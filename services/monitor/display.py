@@ -1,32 +1,100 @@
-"""Shows the state of a run on a live screen, or as plain lines without a terminal."""
+"""Shows the state of a run on a live screen, or as plain lines without a terminal.
+
+Invariants: what cannot be shown ends nothing. Output that fails, such as a closed pipe or terminal,
+is given up, and a warning says so.
+"""
 
 import logging
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from typing import NoReturn
 
 from rich.console import Console
 from rich.live import Live
 
+from mrcdrl.common.runtime.process import discard
 from mrcdrl.services.monitor.screen import Screen, plain_line
 from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.watching import Watching
 
 _PLAIN_PERIOD_S = 10.0
+_PART = "the display"  # as a failure is said
 Show = Callable[[], None]
 
 
 @contextmanager
-def display(state: RunState, name: str, clock: Callable[[], float]) -> Iterator[Show]:
-    """Yield a function that shows the state now: on a live screen, or as a plain line."""
-    console = Console()
-    if not console.is_terminal:
+def display(
+    state: RunState,
+    name: str,
+    clock: Callable[[], float],
+    watching: Watching,
+    lines: Show | None = None,
+) -> Iterator[Show]:
+    """Yield a function that shows the state now: on a live screen, or as a plain line.
 
-        def print_line() -> None:
-            console.print(plain_line(state, clock()), soft_wrap=True, highlight=False)
+    watching: guards all that is written. lines: what to call instead of both.
+    """
+    shown = ExitStack()
+    draw = lines or _plain(state, clock)
 
-        yield at_most_every(_PLAIN_PERIOD_S, clock, print_line)
-        return
+    def show() -> None:
+        nonlocal draw
+        with watching(_PART):
+            try:
+                draw()
+            except OSError:
+                draw = _nothing
+                _give_up(shown)
+                raise
+
+    with watching(_PART):
+        if lines is None and can_draw(console := OpenConsole()):
+            draw = shown.enter_context(_screen(console, state, name, clock))
+    try:
+        yield show
+    finally:
+        with watching(_PART):
+            shown.close()
+
+
+class OpenConsole(Console):
+    """A console that leaves it to its user what a closed pipe ends; rich's ends the process."""
+
+    def on_broken_pipe(self) -> NoReturn:
+        raise BrokenPipeError("its reader has ended")
+
+
+def can_draw(console: Console) -> bool:
+    """Whether this is a terminal with a cursor that moves and with Unicode."""
+    unicode = console.encoding.startswith("utf")
+    return console.is_terminal and not console.is_dumb_terminal and unicode
+
+
+def _plain(state: RunState, clock: Callable[[], float]) -> Show:
+    def print_line() -> None:
+        sys.stdout.write(f"{plain_line(state, clock())}\n")
+        sys.stdout.flush()
+
+    return at_most_every(_PLAIN_PERIOD_S, clock, print_line)
+
+
+@contextmanager
+def _screen(
+    console: Console, state: RunState, name: str, clock: Callable[[], float]
+) -> Iterator[Show]:
     with logging_to(state), Live(console=console, screen=True, auto_refresh=False) as live:
         yield lambda: live.update(Screen(state, clock(), name), refresh=True)
+
+
+def _nothing() -> None:
+    """Show nothing."""
+
+
+def _give_up(shown: ExitStack) -> None:
+    """Leave the screen and drop what waits to be written."""
+    discard(sys.stdout)
+    shown.close()
 
 
 def at_most_every(period_s: float, clock: Callable[[], float], show: Show) -> Show:

@@ -14,6 +14,7 @@ from mrcdrl.common.transport.keys import Keys, role_and_worker
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
+from mrcdrl.services.monitor.watching import Watching
 
 _LOG = logging.getLogger("train")
 M = TypeVar("M")
@@ -22,7 +23,10 @@ M = TypeVar("M")
 class Follower:
     """Subscribes to all statistics, episodes, evaluations and presence of a run.
 
-    recorder: writes them down; None to keep no record.
+    recorder: writes them down, and knows the run's past; None to keep no record. lasted_s: seconds
+    that the run had lasted, where there is no recorder to know it.
+
+    A message that cannot be folded in is left out, which is said once.
     """
 
     def __init__(
@@ -32,6 +36,7 @@ class Follower:
         state: RunState,
         recorder: Recorder | None,
         rule: StoppingRule,
+        lasted_s: float = 0.0,
     ) -> None:
         self._stats = session.queue_subscriber(keys.every_stats)
         self._episodes = session.queue_subscriber(keys.every_episode)
@@ -40,7 +45,10 @@ class Follower:
         self._state = state
         self._recorder = recorder
         self._rule = rule
-        self._lasted_s = state.resumed_at_s = recorder.restore(state, rule) if recorder else 0.0
+        self._watching = Watching()
+        if recorder:
+            lasted_s = state.resumed_at_s = recorder.restore(state, rule)
+        self._lasted_s = lasted_s
         self._started_s = time.monotonic()
         self._record_due_s = 0.0
 
@@ -64,8 +72,9 @@ class Follower:
             self._take(EpisodeSummary, item, self._observe_episode)
         for item in self._evaluations.drain():
             self._take(Evaluation, item, self._observe_evaluation)
-        for key, alive in self._presence.changes():
-            self._state.observe_presence(*role_and_worker(key), alive)
+        with self._watching("following who is up"):
+            for key, alive in self._presence.changes():
+                self._state.observe_presence(*role_and_worker(key), alive)
         if self._recorder and self.lived_s >= self._record_due_s:
             self._record_due_s = self.lived_s + 1.0
             self._recorder.record_metrics(self._state, self.now)
@@ -90,6 +99,9 @@ class Follower:
 
     def _take(self, cls: type[M], item: tuple[str, bytes], observe: Callable[[M], None]) -> None:
         try:
-            observe(decode_published(cls, *item))
+            message = decode_published(cls, *item)
         except WireError as error:
             _LOG.warning("%s message refused: %s", cls.__name__, error)
+            return
+        with self._watching(f"following {cls.__name__} messages"):
+            observe(message)

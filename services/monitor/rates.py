@@ -31,26 +31,28 @@ class Rate:
         self._persistent = persistent
         self._counted = counted
         self._last: float | None = None
-        self._since_s = 0.0
+        self._since_s = self._until_s = 0.0
         self._increments: deque[tuple[float, float]] = deque()
 
     def observe(self, value: float, now: float, restarted: bool = False) -> float:
         """Take the counter's value; return the increase since the previous one."""
         if self._last is None:
-            self._last, self._since_s = value, now
+            self._last = value
+            self._since_s = self._until_s = now
             return value - self._counted if value >= self._counted else value
         increment = value - self._last
         if increment < 0 or (restarted and not self._persistent):
             increment = 0.0 if self._persistent else value
-        self._last = value
+        self._last, self._until_s = value, now
         self._increments.append((now, increment))
         self._forget(now)
         return increment
 
     def per_second(self, now: float) -> float:
-        """Increase over the window, or over the time since the first value if that is shorter."""
+        """Increase over the window, or from the first value to the last if that was shorter."""
         self._forget(now)
-        span = min(WINDOW_S, now - self._since_s)
+        whole = now - self._since_s >= WINDOW_S
+        span = WINDOW_S if whole else self._until_s - self._since_s
         return sum(increment for _, increment in self._increments) / span if span > 0 else 0.0
 
     def _forget(self, now: float) -> None:

@@ -1,12 +1,12 @@
 """Records a run as it goes: lines of JSON, TensorBoard events, a summary at the end.
 
 Invariants: a line that a crash left unfinished is cut off by the next start; a record is handed to
-the operating system by the next `record_metrics` at the latest; a resumed run appends.
+the operating system by the next `record_metrics` at the latest; a resumed run appends. What cannot
+be written once the files are open is said once and ends nothing.
 """
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -16,7 +16,8 @@ from mrcdrl.common.config import Config
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.trajectory import EpisodeSummary
 from mrcdrl.common.runtime.closing import Closing
-from mrcdrl.common.runtime.files import atomic_write, reason
+from mrcdrl.common.runtime.files import atomic_write
+from mrcdrl.services.monitor.events import Events
 from mrcdrl.services.monitor.records import (
     EPISODES,
     EVALUATIONS,
@@ -33,9 +34,11 @@ from mrcdrl.services.monitor.records import (
 from mrcdrl.services.monitor.state import COUNTERS, RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.monitor.summary import summary_bytes
+from mrcdrl.services.monitor.watching import Watching
 
 SUMMARY = "summary.json"
 TENSORBOARD = "tensorboard"
+_RECORDING = "recording"  # as a failure is said
 RATES = tuple(chain.from_iterable(COUNTERS.values()))
 EVALUATION_FIELDS = (
     "success_rate",
@@ -56,6 +59,7 @@ class Recorder(Closing):
         """Raises RunDirectoryError when the directory cannot be written."""
         self.run_dir = run_dir
         self._config = config
+        self._watching = Watching()
         try:
             run_dir.mkdir(parents=True, exist_ok=True)
             for name in (EPISODES, EVALUATIONS, METRICS):
@@ -63,9 +67,9 @@ class Recorder(Closing):
             self._episodes = (run_dir / EPISODES).open("a", encoding="utf-8")
             self._evaluations = (run_dir / EVALUATIONS).open("a", encoding="utf-8")
             self._metrics = (run_dir / METRICS).open("a", encoding="utf-8")
+            self._events = _open_events(run_dir / TENSORBOARD)
         except OSError as error:
             raise RunDirectoryError(f"{run_dir} cannot be written: {error}") from error
-        self._events = _open_events(run_dir / TENSORBOARD)
 
     def __repr__(self) -> str:
         return f"Recorder({str(self.run_dir)!r}, closed={self._metrics.closed})"
@@ -77,7 +81,7 @@ class Recorder(Closing):
     def record_episode(self, episode: EpisodeSummary, state: RunState, now: float) -> None:
         """Write an episode that `state` has observed."""
         record = EpisodeRecord(now, state.learner_steps, episode)
-        with self._writing():
+        with self._watching(_RECORDING):
             self._episodes.write(record_line(record))
         self._event("training/score", episode.score, state.episodes)
         self._event("training/mean_q", episode.mean_q, state.episodes)
@@ -86,7 +90,7 @@ class Recorder(Closing):
 
     def record_evaluation(self, record: EvaluationRecord) -> None:
         """Write what `state.observe_evaluation` returned."""
-        with self._writing():
+        with self._watching(_RECORDING):
             self._evaluations.write(record_line(record))
             self._evaluations.flush()
         for name in EVALUATION_FIELDS:
@@ -95,7 +99,7 @@ class Recorder(Closing):
 
     def record_metrics(self, state: RunState, now: float) -> None:
         """Write the metrics of this second and flush all files; call it once a second."""
-        with self._writing():
+        with self._watching(_RECORDING):
             self._metrics.write(to_line(flat_metrics(state, now)))
         for name in RATES:
             self._event(f"rates/{name}_per_s", state.per_second(name, now), int(now))
@@ -104,40 +108,35 @@ class Recorder(Closing):
                 self._event(f"learner/{name}", value, state.learner_steps)
         self.flush()
 
-    def write_summary(self, state: RunState, now: float, stop_reason: str) -> Path:
-        """Write summary.json in one step; return its path."""
-        path = self.run_dir / SUMMARY
-        with self._writing():
-            atomic_write(path, summary_bytes(state, self._config, now, stop_reason))
-        return path
+    def write_summary(self, state: RunState, now: float, stop_reason: str) -> None:
+        """Write summary.json in one step."""
+        with self._watching(f"writing {SUMMARY}"):
+            content = summary_bytes(state, self._config, now, stop_reason)
+            atomic_write(self.run_dir / SUMMARY, content)
 
     def flush(self) -> None:
         """Hand buffered records to the operating system."""
-        with self._writing():
-            for file in (self._episodes, self._evaluations, self._metrics):
+        for file in (self._episodes, self._evaluations, self._metrics):
+            with self._watching(_RECORDING):
                 file.flush()
         if self._events is not None:
-            self._events.flush()
+            with self._watching(TENSORBOARD):
+                self._events.flush()
 
     def close(self) -> None:
         """Flush and close; a second call does nothing."""
         for file in (self._episodes, self._evaluations, self._metrics):
-            with self._writing():
+            with self._watching(_RECORDING):
                 file.close()
-        if self._events is not None:
-            self._events.close()
-            self._events = None
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise RunDirectoryError(f"{self.run_dir} cannot be written: {reason(error)}") from error
+        events, self._events = self._events, None
+        if events is not None:
+            with self._watching(TENSORBOARD):
+                events.close()
 
     def _event(self, tag: str, value: float, step: int) -> None:
         if self._events is not None and math.isfinite(value):
-            self._events.add_scalar(tag, value, step)
+            with self._watching(TENSORBOARD):
+                self._events.add(tag, value, step)
 
 
 def restore(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
@@ -159,13 +158,12 @@ def restore(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
     return time_s
 
 
-def _open_events(directory: Path) -> Any:
-    """A TensorBoard writer; None if the optional tensorboardX is not installed."""
+def _open_events(directory: Path) -> Events | None:
+    """None if the optional tensorboardX is not installed."""
     try:
-        from tensorboardX import SummaryWriter
+        return Events(directory)
     except ImportError:
         return None
-    return SummaryWriter(str(directory), flush_secs=10, write_to_disk=True)
 
 
 def flat_metrics(state: RunState, now: float) -> dict[str, float | int | None]:

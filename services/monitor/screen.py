@@ -79,6 +79,11 @@ def clock(seconds: float | None) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
 
 
+def told(state: RunState, now: float) -> str:
+    """The time, and since when if that is not the run's start."""
+    return f"{clock(now)} {state.since}".rstrip()
+
+
 def heading(title: str, more: str = "", style: str = "grey62") -> Rule:
     text = Text(title, style="bold").append(f"  {more}" if more else "", style=f"not bold {style}")
     return Rule(text, align="left", style="grey37")
@@ -91,7 +96,7 @@ def header(state: RunState, now: float, name: str, width: int) -> Text:
     left = f" mrcdrl  {name}  {robots} · {config.agent.kind}"
     left += f" · {config.arena.target_layout} targets"
     remaining = state.time_left_s(now)
-    right = clock(now) + (f"  {clock(remaining)} left " if remaining is not None else " ")
+    right = told(state, now) + (f"  {clock(remaining)} left " if remaining is not None else " ")
     room = max(0, width - len(right) - 1)
     return Text(f"{left[:room]:<{room}} {right}", style="bold white on grey23", no_wrap=True)
 
@@ -233,7 +238,7 @@ def evaluations(state: RunState, num_rows: int) -> Text:
         text.append(f" ({100 * low:.0f}–{100 * high:.0f})".ljust(9), style="grey62")
         text.append(f"{e.collision_rate:6.1%} collision{e.timeout_rate:6.1%} time-out")
         text.append(f"  of {e.episodes}", style="grey62")
-    return text if text else Text("  none yet", style="grey62")
+    return text if text else Text(f"  none {state.since or 'yet'}", style="grey62")
 
 
 def limit(state: RunState) -> Rule:
@@ -254,7 +259,7 @@ def plain_line(state: RunState, now: float) -> str:
     last = state.last_evaluation
     test = f"{last.evaluation.success_rate:.1%}" if last else "–"
     fields = [
-        clock(now),
+        told(state, now),
         f"{len(state.alive('actor'))} actors",
         f"robot steps {state.robot_steps} ({state.per_second('robot_steps', now):.0f}/s)",
         f"replay {state.replay_size}/{state.replay_capacity}",

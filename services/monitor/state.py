@@ -71,7 +71,8 @@ class RunState:
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.resumed_at_s = 0.0  # seconds the run had lasted when it was resumed
+        self.resumed_at_s: float | None = 0.0  # seconds the run had lasted when it was resumed
+        self.since = ""  # such as "since status started", where `now` does not count from its start
         self.log: deque[str] = deque(maxlen=LOG_LINES)
         self.evaluations: list[EvaluationRecord] = []
         self.episodes = 0
@@ -303,7 +304,7 @@ class RunState:
     def time_left_s(self, now: float) -> float | None:
         """Time until run.minutes or, at the present rate, run.learner_steps; None if unlimited."""
         run, ends = self.config.run, []
-        if run.minutes:
+        if run.minutes and self.resumed_at_s is not None:
             ends.append(max(0.0, 60 * run.minutes - (now - self.resumed_at_s)))
         rate = self.per_second("learner_steps", now)
         if run.learner_steps and rate > 0:

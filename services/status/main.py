@@ -1,48 +1,58 @@
 """`mrcdrl status`: the processes of a live run, its pace, and its bottleneck."""
 
+import argparse
 import json
 import math
+import sys
+import time
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from mrcdrl.common.config import Config
 from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.errors import DeadlineError, RunDirectoryError, UnreachableError
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.versions import VERSIONED
-from mrcdrl.common.sync.joining import Joining, fetch_config, joining_parser
+from mrcdrl.common.sync.joining import ENDPOINT_FILE, Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
 from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.display import Show, at_most_every, display
 from mrcdrl.services.monitor.follower import Follower
-from mrcdrl.services.monitor.recorder import Recorder, flat_metrics
-from mrcdrl.services.monitor.records import finite
+from mrcdrl.services.monitor.recorder import Recorder, flat_metrics, restore
+from mrcdrl.services.monitor.records import METRICS, finite, read_last_metrics
 from mrcdrl.services.monitor.run_directory import RunDirectory
-from mrcdrl.services.monitor.screen import Screen
+from mrcdrl.services.monitor.screen import Screen, clock
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule, stopped
+from mrcdrl.services.monitor.watching import Watching
 
 _TICK_S = 0.25
 _LISTEN_S = 3.0  # every service reports once a second, and two reports make a rate
 _JSON_PERIOD_S = 1.0
+_RECORDER_WAITS_S = 30.0  # for a run to come up
+_FRESH_S = 10.0  # records are of a run that is up if they are no older; one comes every second
 
 
 def main(argv: Sequence[str]) -> int:
     """Show a run, or keep its records; the exit code."""
     arguments = parser().parse_args(argv)
-    joining, stop = Joining.from_arguments(arguments), StopSignal().listen()
+    stop = StopSignal().listen()
     with ExitStack() as owned:
-        session = owned.enter_context(Session(joining.transport))
-        config = fetch_config(session, joining, stop)
-        recorder = None
+        joining, session, config = join(arguments, stop, owned)
+        state, rule = RunState(config), StoppingRule(config.run)
+        recorder, lasted_s = None, 0.0
         if arguments.record:
             run = owned.enter_context(RunDirectory.join(joining.run_dir, config))
             recorder = owned.enter_context(Recorder(run.path, config))
             session.announce(joining.keys.live("status", joining.worker))
-        state, rule = RunState(config), StoppingRule(config.run)
-        follower = Follower(session, joining.keys, state, recorder, rule)
+        else:
+            lasted_s = recall(joining.run_dir, state, rule)
+        follower = Follower(session, joining.keys, state, recorder, rule, lasted_s)
         if not (arguments.watch or arguments.record):
             listen(follower, Heartbeat(None), stop, lambda: None, until_s=_LISTEN_S)
             print_once(state, follower.now, joining.run, arguments.json)
@@ -51,10 +61,15 @@ def main(argv: Sequence[str]) -> int:
         def print_line() -> None:
             print_once(state, follower.now, joining.run, as_json=True)
 
-        showing = (
-            nullcontext(at_most_every(_JSON_PERIOD_S, lambda: follower.now, print_line))
-            if arguments.json
-            else display(state, joining.run, lambda: follower.now)
+        lines = at_most_every(_JSON_PERIOD_S, lambda: follower.now, print_line)
+        # Who only shows has nothing left to do once nobody reads it; a recorder goes on.
+        watching = Watching(passes=() if recorder else (OSError,))
+        showing = display(
+            state,
+            joining.run,
+            lambda: follower.now,
+            watching,
+            lines if arguments.json else None,
         )
         # Only a recorder is a service: status run in its container must not beat for it.
         heartbeat = Heartbeat.from_environment() if arguments.record else Heartbeat(None)
@@ -63,6 +78,53 @@ def main(argv: Sequence[str]) -> int:
         if recorder is not None:
             recorder.write_summary(state, follower.now, stopped(stop.cause))
     return 0
+
+
+def join(
+    arguments: argparse.Namespace, stop: StopSignal, owned: ExitStack
+) -> tuple[Joining, Session, Config]:
+    """Join the run; a recorder waits for it to come up, and whoever only looks does not.
+
+    Raises UnreachableError, with what the run directory knows, if the run is not up.
+    """
+    wait_s = _RECORDER_WAITS_S if arguments.record else 0.0
+    try:
+        joining = Joining.from_arguments(arguments)
+        session = owned.enter_context(Session(joining.transport, open_timeout_s=wait_s))
+        return joining, session, fetch_config(session, joining, stop, wait_s)
+    except (UnreachableError, DeadlineError) as error:
+        ends = f" at {', '.join(arguments.connect)}" if arguments.connect else ""
+        seen = last_seen(arguments.run_dir / arguments.run)
+        raise UnreachableError(f"run {arguments.run} is not up{ends}; {seen}") from error
+
+
+def last_seen(run_dir: Path) -> str:
+    """When the run last recorded something, as far as this machine knows."""
+    try:
+        at_s = (run_dir / METRICS).stat().st_mtime
+        lasted_s = float(read_last_metrics(run_dir)["time_s"])
+    except (OSError, KeyError):
+        return f"{run_dir} has no records of it"
+    at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_s))
+    return f"last seen {at}, {clock(lasted_s)} after it began"
+
+
+def recall(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
+    """Fold in what the run has recorded on this machine; the seconds it has lasted.
+
+    Where nothing is being recorded, the state says from when on it counts.
+    """
+    try:
+        if time.time() - (run_dir / METRICS).stat().st_mtime < _FRESH_S:
+            lasted_s = restore(run_dir, state, rule)
+            endpoint = run_dir / ENDPOINT_FILE  # written when `mrcdrl train` starts the run
+            up_s = time.time() - endpoint.stat().st_mtime if endpoint.exists() else None
+            state.resumed_at_s = None if up_s is None else max(0.0, lasted_s - up_s)
+            return lasted_s
+    except (OSError, RunDirectoryError):
+        pass
+    state.since, state.resumed_at_s = "since status started", None
+    return 0.0
 
 
 def parser() -> Parser:
@@ -98,10 +160,11 @@ def listen(
 
 def print_once(state: RunState, now: float, run: str, as_json: bool) -> None:
     """Print the screen, or the JSON, of this moment."""
-    console = Console()
     if as_json:
-        console.out(json.dumps(status(state, now)), highlight=False)
+        sys.stdout.write(f"{json.dumps(status(state, now))}\n")
+        sys.stdout.flush()
     else:
+        console = Console()
         console.print(Screen(state, now, run), height=console.height - 1)
 
 
@@ -110,6 +173,7 @@ def status(state: RunState, now: float) -> dict[str, Any]:
     last = state.last_evaluation
     figures = flat_metrics(state, now).items()
     values = {
+        "time_since": state.since or "the run began",
         "limited_by": bottleneck(state).replace("\N{NO-BREAK SPACE}", " "),
         "services": [
             {

@@ -15,6 +15,7 @@ from pathlib import Path
 from mrcdrl.common.config import resolved_environment
 from mrcdrl.common.errors import DivergedError, MrcdrlError
 from mrcdrl.common.runtime.process import ALLOCATOR, last_line, start_service
+from mrcdrl.services.monitor.watching import Watching
 
 _LOG = logging.getLogger("train")
 _TERM_S = 20.0  # a process that was asked to stop is killed after this
@@ -46,6 +47,17 @@ class ManagedProcess:
 
     def last_line(self) -> str:
         return last_line(self.log_path, self.log_begin)
+
+    def new_warnings(self) -> Iterator[str]:
+        """Warnings and errors logged since the last call; raises OSError."""
+        with self.log_path.open("rb") as log:
+            log.seek(self.log_read)
+            text = log.read()
+        whole = text[: text.rfind(b"\n") + 1]
+        self.log_read += len(whole)
+        for line in whole.decode("utf-8", "replace").splitlines():
+            if " WARNING " in line or " ERROR " in line:
+                yield f"{self.worker}: {line.split(': ', 1)[-1]}"
 
 
 class Fleet:
@@ -96,22 +108,18 @@ class Fleet:
                 process.start()
         return None
 
-    def warnings(self) -> Iterator[str]:
-        """Warnings and errors logged since the last call."""
+    def warnings(self, watching: Watching) -> Iterator[str]:
+        """Warnings and errors logged since the last call; a log that cannot be read has none."""
         for process in self._processes:
-            with process.log_path.open("rb") as log:
-                log.seek(process.log_read)
-                text = log.read()
-            whole = text[: text.rfind(b"\n") + 1]
-            process.log_read += len(whole)
-            for line in whole.decode("utf-8", "replace").splitlines():
-                if " WARNING " in line or " ERROR " in line:
-                    yield f"{process.worker}: {line.split(': ', 1)[-1]}"
+            with watching(f"reading {process.log_path}"):
+                yield from process.new_warnings()
 
     def stop(self) -> None:
         """Stop the roles in order, producers before their consumers."""
         for role in _STOP_ORDER:
             stopping = [p for p in self._processes if p.role == role and p.popen is not None]
+            if stopping:
+                _LOG.info("stopping %s …", ", ".join(p.worker for p in stopping))
             for process in stopping:
                 self._signal(process, signal.SIGTERM)
             for process in stopping:
@@ -126,7 +134,7 @@ class Fleet:
             _LOG.warning("%s did not stop within %g s and was killed", process.worker, _TERM_S)
             self._signal(process, signal.SIGKILL)
             code = process.popen.wait()
-        if code not in (0, -signal.SIGKILL):
+        if code not in (0, -signal.SIGTERM, -signal.SIGKILL):
             _LOG.warning("%s ended with code %d: %s", process.worker, code, process.last_line())
         process.popen = None
 

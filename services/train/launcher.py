@@ -4,7 +4,9 @@ Invariants: what no service could do is refused before anything is written; the 
 without its plots.
 """
 
+import contextlib
 import logging
+import os
 import subprocess
 import time
 from collections.abc import Sequence
@@ -17,7 +19,11 @@ from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.extras import require
 from mrcdrl.common.runtime.names import check_name
-from mrcdrl.common.runtime.process import COMMAND, StopSignal
+from mrcdrl.common.runtime.process import (
+    COMMAND,
+    DIE_WITH_PARENT,
+    StopSignal,
+)
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display
@@ -26,10 +32,12 @@ from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule, stopped
+from mrcdrl.services.monitor.watching import Watching
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.resuming import check_unfinished
 
 _LOG = logging.getLogger("train")
+FILM = "evaluation.mp4"
 _TICK_S = 0.25
 _PLOTS_S = 300.0
 _JOIN_S = 60.0
@@ -68,7 +76,8 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     config = load_config(preset, given)
     check_possible(config)
     name = arguments.name or default_name(preset, config.arena.num_robots)
-    return RunDirectory.create(arguments.run_dir / check_name(name, "run name"), config)
+    path = arguments.run_dir / check_name(name, "run name")
+    return (RunDirectory.create if arguments.name else RunDirectory.create_free)(path, config)
 
 
 def check_possible(config: Config, *, resumed: bool = False) -> None:
@@ -91,10 +100,15 @@ def check_possible(config: Config, *, resumed: bool = False) -> None:
         Session(config.transport).close()
 
 
-def supervise(run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSignal) -> str:
-    """Run all processes until a signal or the stopping rule ends the run; the reason."""
+def supervise(
+    run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSignal, hurry: StopSignal
+) -> str:
+    """Run all processes until a signal or the stopping rule ends the run; the reason.
+
+    hurry: listens from then on.
+    """
     config = run.config
-    state, rule = RunState(config), StoppingRule(config.run)
+    state, rule, watching = RunState(config), StoppingRule(config.run), Watching()
     endpoints = config.transport.listen or (free_endpoint(),)
     endpoint = endpoints[0]
     start_replay(run, fleet, endpoints)
@@ -104,16 +118,17 @@ def supervise(run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSig
         if run.resumed:
             rule.go_on()
         start_workers(run, fleet, endpoint)
-        with display(state, run.path.name, lambda: follower.now) as show:
+        with display(state, run.path.name, lambda: follower.now, watching) as show:
             reason = None
             while reason is None:
                 follower.listen(_TICK_S)
-                for line in fleet.warnings():
+                for line in fleet.warnings(watching):
                     state.observe_log(line)
                 show()
                 reason = fleet.watch() or follower.stop_reason()
                 if stop.is_set():
                     reason = stopped(stop.cause)
+        hurry.listen()
         if stop.is_set():
             _LOG.info("stopping (%s) …", stop.cause)
         else:
@@ -181,16 +196,33 @@ def num_actors(config: Config) -> int:
     return config.run.actors or (1 if config.run.turn_size else max(1, available_cores() // 2))
 
 
-def write_plots(run_dir: Path) -> None:
-    """Write the plots and the video of a run, in a separate process; log it if that fails."""
+def write_plots(run_dir: Path, hurry: StopSignal) -> None:
+    """Write the plots and the video of a run, in a separate process, unless a signal skips them.
+
+    Log why they are missing.
+    """
     command = [*COMMAND, "report", str(run_dir)]
-    try:
-        result = subprocess.run(
-            command, capture_output=True, text=True, timeout=_PLOTS_S, check=False
-        )
-    except subprocess.TimeoutExpired:
-        _LOG.warning("plots and video took over %g s and were given up", _PLOTS_S)
+    environment = {**os.environ, DIE_WITH_PARENT: str(os.getpid())}
+    report = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + _PLOTS_S
+    while not hurry.is_set() and time.monotonic() < deadline:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            _, said = report.communicate(timeout=_TICK_S)
+            break
+    else:
+        report.kill()
+        report.communicate()
+        (run_dir / FILM).unlink(missing_ok=True)  # it is written last, and may be cut off
+        why = f"skipped ({hurry.cause})" if hurry.is_set() else f"given up after {_PLOTS_S:g} s"
+        _LOG.warning("plots and video %s; `mrcdrl report %s` writes them", why, run_dir)
         return
-    if result.returncode:
-        last_line = (result.stderr.splitlines() or ["no reason given"])[-1]
+    if report.returncode:
+        last_line = (said.splitlines() or ["no reason given"])[-1]
         _LOG.warning("plots or video are missing: %s", last_line)

@@ -4,9 +4,9 @@ import logging
 from collections.abc import Sequence
 
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.services.monitor.recorder import Recorder
+from mrcdrl.services.monitor.recorder import SUMMARY, Recorder
 from mrcdrl.services.train.fleet import Fleet
-from mrcdrl.services.train.launcher import expectation, open_run, supervise, write_plots
+from mrcdrl.services.train.launcher import FILM, expectation, open_run, supervise, write_plots
 
 _LOG = logging.getLogger("train")
 
@@ -14,16 +14,17 @@ _LOG = logging.getLogger("train")
 def main(argv: Sequence[str]) -> int:
     """Train; the exit code."""
     with open_run(argv) as run:
-        stop = StopSignal().listen()
+        stop, hurry = StopSignal().listen(), StopSignal()
         prefix = "resuming " if run.resumed else ""
         _LOG.info("%srun %s: %s", prefix, run.path, expectation(run.config))
         fleet = Fleet(run.logs)
         try:
             with Recorder(run.path, run.config) as recorder:
-                reason = supervise(run, fleet, recorder, stop)
+                reason = supervise(run, fleet, recorder, stop, hurry)
         finally:
             fleet.stop()
-        _LOG.info("%s; writing plots and video …", reason)
-        write_plots(run.path)
-    _LOG.info("the run is in %s: summary.json, training.png, evaluation.mp4", run.path)
+        _LOG.info("%s; writing plots and video (Ctrl-C skips them) …", reason)
+        write_plots(run.path, hurry)
+    left = [name for name in (SUMMARY, "training.png", FILM) if (run.path / name).is_file()]
+    _LOG.info("the run is in %s%s", run.path, ": " * bool(left) + ", ".join(left))
     return 0

@@ -131,10 +131,9 @@ class Stack:
         return services
 
     def status(self) -> dict[str, Any]:
-        """Output of `mrcdrl status --json`."""
-        said = self.compose(
-            *("exec", "--no-TTY", "status", "mrcdrl", "status", "--run", "stack", "--json")
-        )
+        """Output of `mrcdrl status --json`, once the run is up."""
+        asking = "until mrcdrl status --run stack --json; do sleep 1; done"
+        said = self.compose("exec", "--no-TTY", "status", "sh", "-c", asking)
         told: dict[str, Any] = json.loads(said)
         return told
 

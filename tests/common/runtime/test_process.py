@@ -42,6 +42,36 @@ def test_without_a_deadline_it_takes_its_time() -> None:
     assert run_stuck(0, 1.5) == (0, "listening\ntold\n")
 
 
+HUNG_UP = """
+import signal, sys
+from mrcdrl.common.runtime.process import StopSignal
+signal.signal(signal.SIGHUP, getattr(signal, sys.argv[1]))
+stop = StopSignal().listen()
+signal.raise_signal(signal.SIGHUP)
+print(stop.is_set(), stop.cause)
+"""
+
+
+@pytest.mark.parametrize(("before", "told"), [("SIG_DFL", "True SIGHUP"), ("SIG_IGN", "False ")])
+def test_a_closed_terminal_stops_a_process_unless_nohup_started_it(before: str, told: str) -> None:
+    command = [sys.executable, "-c", HUNG_UP, before]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout == f"{told}\n"
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_command_starts_with_its_output_closed(closed: str) -> None:
+    says = "import sys; from mrcdrl.common.runtime.process import run_main; "
+    says += "sys.exit(run_main(lambda: print('–', flush=True) or 5))"
+    command = ["sh", "-c", f'exec "$0" -c "$1" {closed}', sys.executable, says]
+    result = subprocess.run(
+        command, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"}, timeout=60
+    )
+    assert result.returncode == 5
+    assert result.stdout == (b"" if closed.startswith(">&-") else b"\\u2013\n")
+    assert result.stderr == b""
+
+
 YIELDS = """
 import os
 from pathlib import Path

@@ -177,3 +177,27 @@ def test_a_run_that_a_check_refuses_stays_as_it_was(path: Path) -> None:
         RunDirectory.resume(path, {"run.minutes": "7"}, refuse)
     assert (path / RUN_CONFIG).read_bytes() == before
     RunDirectory.resume(path, {}).close()  # it is held no more
+
+
+def test_default_names_of_runs_that_start_at_once_are_made_unique(path: Path) -> None:
+    made: list[RunDirectory] = []
+    together = threading.Barrier(4)
+
+    def create() -> None:
+        together.wait()
+        made.append(RunDirectory.create_free(path, CONFIG))
+
+    threads = [threading.Thread(target=create) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(run.path.name for run in made) == ["first", "first-2", "first-3", "first-4"]
+    for run in made:
+        run.close()
+
+
+def test_a_name_that_cannot_be_created_is_not_tried_again(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunDirectoryError, match="cannot create"):
+        RunDirectory.create_free(tmp_path / "file" / "run", CONFIG)

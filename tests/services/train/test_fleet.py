@@ -1,5 +1,6 @@
 """The fleet with real processes: small ones in place of the services."""
 
+import logging
 import os
 import signal
 import sys
@@ -10,6 +11,7 @@ import pytest
 
 from mrcdrl.common.errors import DivergedError, MrcdrlError
 from mrcdrl.common.runtime import process
+from mrcdrl.services.monitor.watching import Watching
 from mrcdrl.services.train import fleet as fleet_module
 from mrcdrl.services.train.fleet import Fleet
 
@@ -198,14 +200,47 @@ def test_warnings_in_the_logs_are_reported_once(beside: Path, fleet: Fleet) -> N
     put(beside, "actor", _WAITS)
     fleet.start("actor", "actor-0", [])
     ready(beside)
-    assert list(fleet.warnings()) == ["actor-0: replay is late"]
-    assert list(fleet.warnings()) == []
+    watching = Watching()
+    assert list(fleet.warnings(watching)) == ["actor-0: replay is late"]
+    assert list(fleet.warnings(watching)) == []
     with (beside / "actor-0.log").open("a") as log:
         log.write("10:00 ERROR actor: not whole")
         log.flush()
-        assert list(fleet.warnings()) == []
+        assert list(fleet.warnings(watching)) == []
         log.write(" yet\n")
-    assert list(fleet.warnings()) == ["actor-0: not whole yet"]
+    assert list(fleet.warnings(watching)) == ["actor-0: not whole yet"]
+
+
+def test_a_log_that_was_deleted_is_said_once_and_the_others_are_read(
+    beside: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
+    watching = Watching()
+    for role in ("replay", "actor"):
+        put(beside, role, _WAITS)
+        fleet.start(role, f"{role}-0", [])
+        ready(beside)
+    (beside / "replay-0.log").unlink()
+    assert list(fleet.warnings(watching)) == ["actor-0: replay is late"]
+    assert list(fleet.warnings(watching)) == []
+    assert [r.getMessage() for r in caplog.records] == [
+        f"reading {beside}/replay-0.log failed: No such file or directory; the run goes on"
+    ]
+
+
+def test_each_step_of_the_end_is_said_and_a_service_stopped_by_us_is_no_warning(
+    beside: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    put(beside, "replay", _WAITS)
+    put(beside, "actor", _WAITS.replace("lambda *_: sys.exit(0)", "signal.SIG_DFL"))
+    for worker in ("replay-0", "actor-0", "actor-1"):
+        fleet.start(worker[:-2], worker, [])
+        ready(beside)
+    fleet.stop()
+    assert [(r.levelname, r.getMessage()) for r in caplog.records] == [
+        ("INFO", "stopping actor-0, actor-1 …"),
+        ("INFO", "stopping replay-0 …"),
+    ]
 
 
 def test_settings_in_the_environment_are_not_passed_on(
