@@ -46,6 +46,7 @@ class Follower:
         self._recorder = recorder
         self._rule = rule
         self._watching = Watching()
+        self._refused = 0
         if recorder:
             lasted_s = state.resumed_at_s = recorder.restore(state, rule)
         self._lasted_s = lasted_s
@@ -101,7 +102,11 @@ class Follower:
         try:
             message = decode_published(cls, *item)
         except WireError as error:
-            _LOG.warning("%s message refused: %s", cls.__name__, error)
+            self._refused += 1
+            if self._refused.bit_count() == 1:  # the 1st, 2nd, 4th …, as a peer may send many
+                _LOG.warning(
+                    "%s message refused, %d so far: %s", cls.__name__, self._refused, error
+                )
             return
         with self._watching(f"following {cls.__name__} messages"):
             observe(message)

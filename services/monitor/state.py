@@ -24,6 +24,7 @@ SHARES = of_kind("share")
 STALENESS = ("versions", "s")
 HISTORY_PERIOD = 10  # episodes between two points of the success curve
 LOG_LINES = 100
+MAX_SERVICES = 4096  # a peer may claim any number of names
 
 
 @dataclass(slots=True)
@@ -157,7 +158,11 @@ class RunState:
         self._before = counted
 
     def _service(self, role: str, service_id: str) -> Service:
-        return self._services.setdefault((role, service_id), Service(role, service_id))
+        """The service of that name; one that is kept nowhere if there are too many."""
+        key, new = (role, service_id), Service(role, service_id)
+        if len(self._services) >= MAX_SERVICES:
+            return self._services.get(key, new)
+        return self._services.setdefault(key, new)
 
     # -- services -----------------------------------------------------------------------
 

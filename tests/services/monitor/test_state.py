@@ -6,7 +6,7 @@ from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
 from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.recorder import flat_metrics
-from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.state import MAX_SERVICES, RunState
 
 
 def config(**overrides: str) -> Config:
@@ -213,3 +213,14 @@ def test_the_run_waits_for_a_missing_role() -> None:
     state.observe_stats(replay(size=0), 0)
     state.observe_stats(actor(1), 0)
     assert bottleneck(state) == "waiting for the learner to start"
+
+
+def test_a_peer_that_claims_many_names_does_not_fill_the_memory() -> None:
+    state = RunState(config())
+    state.observe_stats(learner(10), 0)
+    for number in range(MAX_SERVICES + 100):
+        state.observe_stats(actor(1, f"x{number}"), 0)
+        state.observe_presence("actor", f"y{number}", True)
+    assert len(state.services) == MAX_SERVICES
+    state.observe_stats(learner(20), 1)
+    assert state.learner_steps == 20
