@@ -21,6 +21,7 @@ from types import FrameType
 from typing import TextIO
 
 from mrcdrl.common.errors import MrcdrlError
+from mrcdrl.common.runtime.files import reason
 
 DIE_WITH_PARENT = "MRCDRL_DIE_WITH_PARENT"  # the process id of the launcher, which sets it
 # Environment of processes that learn: they keep freed memory. Otherwise each large tensor is mapped
@@ -156,6 +157,7 @@ def start_service(
     role: str, flags: Sequence[str], log: Path, environment: Mapping[str, str]
 ) -> "subprocess.Popen[bytes]":
     """Start a service in its own session, its output appended to the log; it ends with us."""
+    log.parent.mkdir(exist_ok=True)  # someone may have cleared it away meanwhile
     with log.open("ab") as output:
         return subprocess.Popen(
             [*COMMAND, role, *flags],
@@ -169,7 +171,10 @@ def start_service(
 
 def last_line(log: Path, begin: int = 0) -> str:
     """The last line of a log from this byte on, usually the reason why its service ended."""
-    lines = log.read_bytes()[begin:].decode("utf-8", "replace").strip().splitlines()
+    try:
+        lines = log.read_bytes()[begin:].decode("utf-8", "replace").strip().splitlines()
+    except OSError as error:
+        return f"its log cannot be read: {reason(error)}"
     return lines[-1] if lines else "its log is empty"
 
 

@@ -41,6 +41,7 @@ class ManagedProcess:
 
     def start(self) -> None:
         self.log_begin = self.log_path.stat().st_size if self.log_path.exists() else 0
+        self.log_read = min(self.log_read, self.log_begin)  # the log may have been cleared away
         environment = {**ALLOCATOR, **resolved_environment()}
         self.popen = start_service(self.role, self.arguments, self.log_path, environment)
         self.started_s = time.monotonic()

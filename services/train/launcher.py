@@ -201,6 +201,8 @@ def write_plots(run_dir: Path, hurry: StopSignal) -> None:
 
     Log why they are missing.
     """
+    film = run_dir / FILM
+    before = film.stat().st_mtime_ns if film.exists() else None
     command = [*COMMAND, "report", str(run_dir)]
     environment = {**os.environ, DIE_WITH_PARENT: str(os.getpid())}
     report = subprocess.Popen(
@@ -219,7 +221,8 @@ def write_plots(run_dir: Path, hurry: StopSignal) -> None:
     else:
         report.kill()
         report.communicate()
-        (run_dir / FILM).unlink(missing_ok=True)  # it is written last, and may be cut off
+        if film.exists() and film.stat().st_mtime_ns != before:
+            film.unlink()  # it is written last, and was cut off
         why = f"skipped ({hurry.cause})" if hurry.is_set() else f"given up after {_PLOTS_S:g} s"
         _LOG.warning("plots and video %s; `mrcdrl report %s` writes them", why, run_dir)
         return

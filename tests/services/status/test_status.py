@@ -1,6 +1,8 @@
 """`mrcdrl status`: what it shows of a run, and how it locks the run directory."""
 
 import json
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -15,10 +17,12 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.run_directory import RunDirectory
+from mrcdrl.services.monitor.screen import plain_line
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
-from mrcdrl.services.status.main import listen, status
+from mrcdrl.services.status.main import last_seen, listen, recall, status
 
 
 def test_status_without_processes() -> None:
@@ -73,3 +77,54 @@ def test_a_run_that_is_recorded_is_locked(tmp_path: Path) -> None:
         with pytest.raises(RunDirectoryError, match="in use"):
             RunDirectory.join(tmp_path / "run", Config())
     RunDirectory.join(tmp_path / "run", Config()).close()
+
+
+def recorded(run_dir: Path, seconds: int) -> None:
+    """Record as the launcher does: an actor at 254 robot steps a second, and 90 episodes."""
+    state = RunState(Config())
+    with Recorder(run_dir, Config()) as recorder:
+        for second in range(seconds + 1):
+            counted = {"env_steps": 127.0 * second, "robot_steps": 254.0 * second}
+            state.observe_stats(Stats("actor", "a", counted), second)
+            recorder.record_metrics(state, second)
+
+
+def test_the_time_and_counters_of_a_run_that_is_recorded_here_are_its_own(tmp_path: Path) -> None:
+    recorded(tmp_path, 70)
+    state = RunState(Config())
+    now = recall(tmp_path, state, StoppingRule(Config().run))
+    assert now == 70
+    assert state.resumed_at_s is None  # who started it, and when, is not known here
+    for second in (1, 2):
+        counted = {"env_steps": 127.0 * (70 + second), "robot_steps": 254.0 * (70 + second)}
+        state.observe_stats(Stats("actor", "a", counted), now + second)
+    told = status(state, now + 3)
+    assert (told["time_since"], told["time_s"]) == ("the run began", 73)
+    assert told["robot_steps"] == 254 * 72
+    assert told["robot_steps_per_s"] == 254
+    (tmp_path / "endpoint").write_text("tcp/127.0.0.1:1")
+    recall(tmp_path, state, StoppingRule(Config().run))
+    assert state.resumed_at_s == pytest.approx(70, abs=60)
+
+
+@pytest.mark.parametrize("records", ["none", "old"])
+def test_where_nothing_is_recorded_status_says_since_when_it_counts(
+    records: str, tmp_path: Path
+) -> None:
+    if records == "old":
+        recorded(tmp_path, 70)
+        os.utime(tmp_path / "metrics.jsonl", (0, 0))
+    state = RunState(Config())
+    assert recall(tmp_path, state, StoppingRule(Config().run)) == 0
+    assert status(state, 3.0)["time_since"] == "since status started"
+    line = plain_line(state, 3.0)
+    assert line.startswith("0:00:03 since status started  ")
+    assert "left" not in line
+
+
+def test_a_run_was_last_seen_when_it_last_recorded(tmp_path: Path) -> None:
+    assert last_seen(tmp_path / "run") == f"{tmp_path}/run has no records of it"
+    recorded(tmp_path / "run", 70)
+    at_s = time.mktime((2026, 11, 29, 1, 20, 5, 0, 0, -1))
+    os.utime(tmp_path / "run" / "metrics.jsonl", (at_s, at_s))
+    assert last_seen(tmp_path / "run") == "last seen 2026-11-29 01:20:05, 0:01:10 after it began"

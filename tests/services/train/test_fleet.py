@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from mrcdrl.common.config import resolved_environment
 from mrcdrl.common.errors import DivergedError, MrcdrlError
 from mrcdrl.common.runtime import process
 from mrcdrl.services.monitor.watching import Watching
@@ -227,6 +229,28 @@ def test_a_log_that_was_deleted_is_said_once_and_the_others_are_read(
     ]
 
 
+def test_a_service_is_restarted_although_the_logs_were_cleared_away(
+    beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", 0.0)
+    monkeypatch.setattr(fleet, "_logs", beside / "logs")
+    put(beside, "actor", _WAITS)
+    watching = Watching()
+    (beside / "logs").mkdir()
+    fleet.start("actor", "actor-0", [])
+    first = ready(beside)
+    assert list(fleet.warnings(watching)) == ["actor-0: replay is late"]
+    shutil.rmtree(beside / "logs")
+    os.kill(first, signal.SIGKILL)
+    assert watch_until_ended(fleet) is None
+    ready(beside)
+    assert list(fleet.warnings(watching)) == ["actor-0: replay is late"]
+    shutil.rmtree(beside / "logs")
+    assert process.last_line(beside / "logs" / "actor-0.log") == (
+        "its log cannot be read: No such file or directory"
+    )
+
+
 def test_each_step_of_the_end_is_said_and_a_service_stopped_by_us_is_no_warning(
     beside: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -248,7 +272,7 @@ def test_settings_in_the_environment_are_not_passed_on(
 ) -> None:
     monkeypatch.setenv("MRCDRL_LEARNER__SEED", "1")
     monkeypatch.setenv("MRCDRL_DIE_WITH_PARENT", "1")
-    environment = fleet_module.resolved_environment()
+    environment = resolved_environment()
     assert "MRCDRL_LEARNER__SEED" not in environment
     assert environment["MRCDRL_DIE_WITH_PARENT"] == "1"
     assert environment["PATH"] == os.environ["PATH"]

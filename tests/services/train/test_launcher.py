@@ -1,17 +1,27 @@
 """A run that no service could serve is refused before anything is written; others start."""
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from mrcdrl.common.config import Config, TransportConfig, load_config
 from mrcdrl.common.errors import ConfigError, EndpointError
+from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.replay.serving import Serving
+from mrcdrl.services.train import launcher
 from mrcdrl.services.train.fleet import Fleet
-from mrcdrl.services.train.launcher import check_possible, start_replay, start_workers
+from mrcdrl.services.train.launcher import (
+    FILM,
+    check_possible,
+    start_replay,
+    start_workers,
+    write_plots,
+)
 
 
 def smoke(**overrides: str) -> Config:
@@ -77,3 +87,50 @@ def test_a_port_in_use_is_refused() -> None:
         pytest.raises(EndpointError, match=endpoint),
     ):
         check_possible(smoke(transport__listen=f'["{endpoint}"]'))
+
+
+class When(StopSignal):
+    """Set by Ctrl-C as soon as something is so."""
+
+    def __init__(self, so: Callable[[], bool]) -> None:
+        super().__init__()
+        self.cause, self._so = "Ctrl-C", so
+
+    def is_set(self) -> bool:
+        return self._so()
+
+
+REPORTS = """
+import pathlib, sys, time
+run = pathlib.Path(sys.argv[-1])
+(run / "training.png").write_bytes(b"whole")
+if (run / "films").exists():
+    (run / "evaluation.mp4").write_bytes(b"cut off")
+(run / "ready").touch()
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("films", [True, False])
+def test_a_signal_skips_the_plots_and_leaves_whole_files_only(
+    films: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(launcher, "COMMAND", (sys.executable, "-c", REPORTS))
+    (tmp_path / FILM).write_bytes(b"of an earlier start")
+    if films:
+        (tmp_path / "films").touch()
+    write_plots(tmp_path, When((tmp_path / "ready").exists))
+    assert caplog.messages == [
+        f"plots and video skipped (Ctrl-C); `mrcdrl report {tmp_path}` writes them"
+    ]
+    assert (tmp_path / "training.png").exists()
+    assert (tmp_path / FILM).exists() == (not films)
+
+
+def test_the_reason_why_plots_are_missing_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fails = "import sys; sys.exit('mrcdrl: the run has no weights')"
+    monkeypatch.setattr(launcher, "COMMAND", (sys.executable, "-c", fails))
+    write_plots(tmp_path, StopSignal())
+    assert caplog.messages == ["plots or video are missing: mrcdrl: the run has no weights"]
