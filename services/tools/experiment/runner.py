@@ -4,6 +4,7 @@ Invariants: a cell is worked at by one process at a time, whoever started it; wh
 cell, and the others go on. Processes end with this one.
 """
 
+import contextlib
 import logging
 import os
 import subprocess
@@ -18,7 +19,8 @@ from mrcdrl.services.tools.experiment.cell import CellFiles, lock
 
 _LOG = logging.getLogger("experiment")
 _POLL_S = 0.25
-_END_S = 120.0  # train draws its plots when it is stopped; then it is killed
+_ASKED_S = 20.0  # a process that was asked to end is asked again; train then skips its plots
+_TIMES_ASKED = 6  # then it is killed
 
 
 class Work:
@@ -60,13 +62,17 @@ class Work:
             self._process.terminate()
 
     def join(self) -> None:
-        """Wait until the process has ended, or kill it."""
-        if self._process is not None:
-            try:
-                self._process.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        """Wait until the process has ended, ask it again, or kill it."""
+        process = self._process
+        if process is not None:
+            for _ in range(_TIMES_ASKED):
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_ASKED_S)
+                    break
+                process.terminate()
+            else:
+                process.kill()
+                process.wait()
         self._log.close()
 
     def _to_the_end(self) -> Iterator[None]:

@@ -42,7 +42,7 @@ agent.loss = "squared"
 
 # Trains at once, notes its arguments, and obeys the files named for it.
 SCRIPT = """
-import json, sys, time
+import json, signal, sys, time
 from pathlib import Path
 
 here = Path(__file__).parent
@@ -60,7 +60,12 @@ if (here / "fails").exists() and (here / "fails").read_text() in name:
     sys.exit("mrcdrl: replay-0 failed: no room")
 run.mkdir(exist_ok="--resume" in flags)
 if (here / "slow").exists():
-    time.sleep(600)
+    asked = []
+    signal.signal(signal.SIGTERM, lambda number, _frame: asked.append(number))
+    (run / "ready").touch()
+    while len(asked) < int((here / "slow").read_text()):
+        time.sleep(0.01)
+    sys.exit()
 (run / "config.toml").touch()
 (run / "checkpoints" / "step_000000100").mkdir(parents=True)
 (run / "evaluations.jsonl").write_bytes((here / "evaluations").read_bytes())
@@ -255,14 +260,18 @@ def test_a_training_that_was_stopped_is_not_done(bench: Bench) -> None:
     assert bench.cells()[0].failure == "training did not come to its end: stopped (SIGTERM)"
 
 
-def test_a_signal_stops_the_cells_at_work_and_they_can_be_resumed(bench: Bench) -> None:
-    (bench.folder / "slow").touch()
+@pytest.mark.parametrize("asked", [1, 2, 1000], ids=["ends", "asked again", "killed"])
+def test_a_signal_stops_the_cells_at_work_and_they_can_be_resumed(
+    asked: int, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "_ASKED_S", 0.5)
+    (bench.folder / "slow").write_text(str(asked))
     files = bench.cells()[:2]
     files[0].run.parent.mkdir(parents=True)
     stop = runner.StopSignal()
 
     def tick(at_work: int) -> None:
-        if at_work == 2 and all(f.run.exists() for f in files):
+        if at_work == 2 and all((f.run / "ready").exists() for f in files):
             stop.set()
 
     runner.run_cells(files, 2, "", stop, tick)
