@@ -7,6 +7,7 @@ library is imported: a check every few seconds must cost next to nothing.
 
 import argparse
 import contextlib
+import math
 import os
 import signal
 import sys
@@ -72,8 +73,8 @@ def main(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m mrcdrl.common.runtime.heartbeat", description=main.__doc__
     )
-    parser.add_argument("--max-age", type=float, default=30.0, metavar="S")
-    parser.add_argument("--kill-after", type=float, metavar="S", help="default: never")
+    parser.add_argument("--max-age", type=_seconds, default=30.0, metavar="S")
+    parser.add_argument("--kill-after", type=_seconds, metavar="S", help="default: never")
     arguments = parser.parse_args(argv)
     now_s = time.monotonic()
     try:
@@ -86,6 +87,13 @@ def main(argv: Sequence[str]) -> int:
     if arguments.kill_after is not None and now_s - pulse.beat_s > arguments.kill_after:
         os.kill(pulse.pid, signal.SIGKILL)  # its supervisor restarts it
     return 1 if problem else 0
+
+
+def _seconds(text: str) -> float:
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0 and finite")
+    return number
 
 
 if __name__ == "__main__":

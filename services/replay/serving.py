@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Self
 
 from mrcdrl.common.config import Config, TransportConfig, load_config, refuse_changes
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.sync.joining import recorded_endpoint
@@ -37,7 +37,7 @@ class Serving:
         parser.add_argument("--listen", action="append", help="endpoint, as tcp/127.0.0.1:7447")
         parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
         parser.add_argument(
-            "--shard", type=int, default=0, help="number among replay.shards, from 0"
+            "--shard", type=whole_number(0), default=0, help="number among replay.shards, from 0"
         )
         parser.add_argument("--id", help="this worker's name; default: from the shard")
         parser.add_argument(

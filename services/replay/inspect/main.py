@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mrcdrl.common.config import Config, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.services.replay.inspect.contents import log_directory, read_contents
 from mrcdrl.services.replay.inspect.export import write_export
@@ -25,7 +25,9 @@ def main(argv: Sequence[str]) -> int:
     parser = Parser(prog="mrcdrl replay inspect", description=description)
     parser.add_argument("run", type=Path, help="the run directory, or its name under --run-dir")
     parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
-    parser.add_argument("--shard", type=int, default=0, help="the replay shard; default: 0")
+    parser.add_argument(
+        "--shard", type=whole_number(0), default=0, help="the replay shard; default: 0"
+    )
     parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--export", type=Path, metavar="FILE.npz", help="write the transitions")

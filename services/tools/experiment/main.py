@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 
-from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.runtime.files import atomic_write, reason
 from mrcdrl.common.runtime.process import StopSignal
@@ -58,13 +58,10 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="mrcdrl experiment", description="Train a grid: settings and seeds.")
     parser.add_argument("grid", type=Path, help="a TOML file: see docs/experiments.md")
     parser.add_argument("--out", type=Path, help="folder of results; runs/experiments/GRID")
-    parser.add_argument("--jobs", type=int, default=1, help="cells at once; default: 1")
+    parser.add_argument("--jobs", type=whole_number(1), default=1, help="cells at once; default: 1")
     parser.add_argument("--only", metavar="PATTERN", default="*", help="cells named so, as 'x-*'")
     parser.add_argument("--list", action="store_true", help="print each cell's state, do nothing")
-    arguments = parser.parse_args(argv)
-    if arguments.jobs < 1:
-        parser.error(f"--jobs {arguments.jobs}: at least 1")
-    return arguments
+    return parser.parse_args(argv)
 
 
 def _reporter(cells: Sequence[CellFiles]) -> Callable[[int], None]:

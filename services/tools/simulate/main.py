@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 
 from mrcdrl.common.config import DEFAULT_PRESET, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.names import check_name
@@ -58,7 +58,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="mrcdrl simulate", description=__doc__.splitlines()[0].split(": ")[1])
-    parser.add_argument("--actors", type=_count, default=200)
+    parser.add_argument("--actors", type=whole_number(1), default=200)
     parser.add_argument("--minutes", type=_positive, default=1.0)
     parser.add_argument(
         "--rate",
@@ -67,7 +67,9 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         help="robot steps per second of each actor, or max: as many as are acknowledged; "
         f"default: {ROBOT_STEPS_PER_S:g}, those of an actor with a dedicated core",
     )
-    parser.add_argument("--processes", type=_count, help="of the actors; default: one per core")
+    parser.add_argument(
+        "--processes", type=whole_number(1), help="of the actors; default: one per core"
+    )
     parser.add_argument("--publications", type=_frequency, help="of weights a second; default: 1")
     parser.add_argument("--router", action="store_true", help="put a router in front of replay")
     parser.add_argument("--config", help=f"a preset or a TOML file; default: {DEFAULT_PRESET}")
@@ -101,13 +103,6 @@ def _check_joining(parser: Parser, arguments: argparse.Namespace) -> None:
             f"run {arguments.run!r} would train on made-up data; give a run whose name begins "
             f"with {NAME!r}, or --force"
         )
-
-
-def _count(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
-    return number
 
 
 def _positive(text: str) -> float:

@@ -1,5 +1,8 @@
 """Flags made from the schema, and suggestions for unknown ones."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from mrcdrl.common.config import load_config, sections
@@ -117,3 +120,18 @@ def test_a_number_out_of_range_is_one_line(
     with pytest.raises(SystemExit):
         parser.parse_args(["--seed", text])
     assert f"argument --seed: {reason}" in capsys.readouterr().err
+
+
+ROOT = Path(__file__).parents[3]
+COMMANDS = [path for top in ("common", "services") for path in (ROOT / top).rglob("*.py")]
+
+
+def test_no_flag_takes_a_number_without_limits() -> None:
+    unlimited = [
+        f"{path.relative_to(ROOT)}: {found}"
+        for path in COMMANDS
+        for found in re.findall(
+            r"add_argument\([^#]*?type=(?:int|float)\b", path.read_text("utf-8")
+        )
+    ]
+    assert unlimited == []

@@ -82,3 +82,12 @@ def test_a_process_that_hangs_is_killed(
         else:
             assert process.wait(10) == -9
         process.kill()
+
+
+@pytest.mark.parametrize("age", ["nan", "inf", "0", "-1"])
+def test_an_age_that_no_file_exceeds_is_refused(
+    age: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([f"--max-age={age}"])
+    assert f"{age}: must be above 0 and finite" in capsys.readouterr().err
