@@ -119,6 +119,7 @@ def test_status_tells_the_runs_time_and_a_closed_terminal_and_a_second_signal_en
             assert told["time_s"] > recorded["time_s"]
             assert told["episodes"] >= recorded["episodes"]
             assert told["success_rate"] is not None
+            _watch_and_leave([*asked, "--watch", "--json"])
             train.signal(signal.SIGHUP)
             eventually(lambda: "stopping (SIGHUP)" in train.err, "the end begins")
             train.signal(signal.SIGINT)
@@ -138,3 +139,14 @@ def test_status_tells_the_runs_time_and_a_closed_terminal_and_a_second_signal_en
         assert f"run {name} is not up at tcp/127.0.0.1:9; last seen 2" in line
     finally:
         end_all(name)
+
+
+def _watch_and_leave(arguments: list[str | Path]) -> None:
+    """Who only shows a run ends when nobody looks any more."""
+    watch = start(arguments, subprocess.PIPE, subprocess.PIPE)
+    assert watch.stdout is not None
+    assert json.loads(watch.stdout.readline())["services"] is not None
+    watch.stdout.close()
+    watch.stdout = None
+    _, said = watch.communicate(timeout=PATIENCE_S)
+    assert (watch.returncode, said) == (CLOSED_PIPE, b"")

@@ -8,12 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from mrcdrl.common.config import load_config
+from mrcdrl.common.config import TransportConfig, load_config
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
+from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.monitor.follower import Follower
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.records import read_episodes, read_last_metrics
+from mrcdrl.services.monitor.screen import plain_line
 from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.monitor.watching import Watching
 
 CONFIG = load_config("smoke", environ={})
@@ -98,6 +104,50 @@ def test_a_full_disk_ends_no_run_and_recording_goes_on_when_there_is_room(
     assert read_last_metrics(tmp_path)["time_s"] == 9.0
     assert len(read_episodes(tmp_path)) >= 200
     assert events_of(tmp_path) > 200
+
+
+class Odd(RunState):
+    """Cannot fold in what an actor called odd says."""
+
+    def observe_stats(self, stats: Stats, now: float) -> None:
+        if stats.id == "odd":
+            raise OverflowError("int too large")
+        super().observe_stats(stats, now)
+
+
+def test_a_message_that_cannot_be_folded_in_is_left_out_and_the_next_are_not(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    state, keys = Odd(CONFIG), Keys("odd")
+    with Session(TransportConfig(listen=(free_endpoint(),))) as session:
+        follower = Follower(session, keys, state, None, StoppingRule(CONFIG.run))
+        for actor in ("odd", "odd", "even"):
+            stats = Stats("actor", actor, {"robot_steps": 5.0}, {})
+            session.publisher(keys.stats("actor", actor)).put(encode(stats))
+        while not state.robot_steps:
+            follower.listen(0.05)
+    assert caplog.messages == [
+        "following Stats messages failed: OverflowError: int too large; the run goes on"
+    ]
+
+
+@pytest.mark.parametrize("steps", [1e19, -1.0, float("nan"), float("inf")])
+def test_one_odd_count_of_learner_steps_ends_nothing(steps: float, tmp_path: Path) -> None:
+    state, keys, rule = RunState(CONFIG), Keys("odd"), StoppingRule(CONFIG.run)
+    with (
+        Session(TransportConfig(listen=(free_endpoint(),))) as session,
+        Recorder(tmp_path, CONFIG) as recorder,
+    ):
+        follower = Follower(session, keys, state, recorder, rule)
+        for learner, count in (("x1", steps), ("0", 7.0)):
+            stats = Stats("learner", learner, {"learner_steps": count, "weights_version": count})
+            session.publisher(keys.stats("learner", learner)).put(encode(stats))
+        while not state.learner_steps:
+            follower.listen(0.05)
+        assert "learner steps 7 " in plain_line(state, follower.now)
+        assert follower.stop_reason() is None
+        recorder.record_metrics(state, follower.now)
+    assert read_last_metrics(tmp_path)["learner_steps"] == 7
 
 
 def events_of(run_dir: Path) -> int:
