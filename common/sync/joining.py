@@ -89,8 +89,8 @@ def fetch_config(
 ) -> Config:
     """Ask replay for the run's configuration, and put this process's own settings over it.
 
-    Raises DeadlineError if nobody serves that run within the time, WireError if what is served is
-    no configuration.
+    Raises DeadlineError if nobody serves that run within the time, WireError if the answer is not
+    a configuration.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)
