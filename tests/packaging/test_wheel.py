@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 ROOT = Path(__file__).resolve().parents[2]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
 PACKAGES = ("common", "services", "configs")  # links of these names in mrcdrl/ lead to them
-FOLDERS = (*PACKAGES, "mrcdrl", "tests", "docs", "examples")
+FOLDERS = (*PACKAGES, "mrcdrl", "tests", "docs", "examples", "experiments")
 FILES = (
     *("pyproject.toml", "MANIFEST.in", "constraints.txt", "Makefile"),
     *("README.md", "CHANGELOG.md", "LICENSE"),
@@ -125,7 +125,7 @@ def test_the_wheel_of_the_sdist_is_the_wheel_of_the_tree(
     assert contents(direct) == contents(built[1])
 
 
-def test_the_sdist_holds_tests_docs_and_licence(built: tuple[Path, Path]) -> None:
+def test_the_sdist_holds_tests_docs_grids_and_licence(built: tuple[Path, Path]) -> None:
     with tarfile.open(built[0]) as archive:
         names = {member.name.partition("/")[2]: member for member in archive.getmembers()}
     assert not [name for name, member in names.items() if member.issym() or member.islnk()]
@@ -135,6 +135,7 @@ def test_the_sdist_holds_tests_docs_and_licence(built: tuple[Path, Path]) -> Non
         "README.md",
         "constraints.txt",
         "docs/architecture.md",
+        "experiments/smoke.toml",
         "mrcdrl/common/errors.py",
         "tests/packaging/test_wheel.py",
     }
