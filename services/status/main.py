@@ -93,9 +93,9 @@ def join(
         session = owned.enter_context(Session(joining.transport, open_timeout_s=wait_s))
         return joining, session, fetch_config(session, joining, stop, wait_s)
     except (UnreachableError, DeadlineError) as error:
-        ends = f" at {', '.join(arguments.connect)}" if arguments.connect else ""
         seen = last_seen(arguments.run_dir / arguments.run)
-        raise UnreachableError(f"run {arguments.run} is not up{ends}; {seen}") from error
+        why = str(error).partition(";")[0]
+        raise UnreachableError(f"run {arguments.run} is not up: {why}; {seen}") from error
 
 
 def last_seen(run_dir: Path) -> str:
@@ -104,7 +104,7 @@ def last_seen(run_dir: Path) -> str:
         at_s = (run_dir / METRICS).stat().st_mtime
         lasted_s = float(read_last_metrics(run_dir)["time_s"])
     except (OSError, KeyError):
-        return f"{run_dir} has no records of it"
+        return f"{run_dir} has no records of it; give --connect if it runs elsewhere"
     at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_s))
     return f"last seen {at}, {clock(lasted_s)} after it began"
 

@@ -19,11 +19,7 @@ from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.extras import require
 from mrcdrl.common.runtime.names import check_name
-from mrcdrl.common.runtime.process import (
-    COMMAND,
-    DIE_WITH_PARENT,
-    StopSignal,
-)
+from mrcdrl.common.runtime.process import COMMAND, DIE_WITH_PARENT, StopSignal
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display

@@ -131,12 +131,12 @@ def test_status_tells_the_runs_time_and_a_closed_terminal_and_a_second_signal_en
         with Command(asked, tmp_path) as status:
             assert status.wait() == 1
         line = error_line(status.err)
-        assert f"run {name} is not up; last seen 2" in line
+        assert f"run {name} is not up: no run is up in {run}; last seen 2" in line
         assert "after it began" in line
         with Command([*asked, "--connect", "tcp/127.0.0.1:9"], tmp_path) as status:
             assert status.wait() == 1
         line = error_line(status.err)
-        assert f"run {name} is not up at tcp/127.0.0.1:9; last seen 2" in line
+        assert f"run {name} is not up: nobody answers at tcp/127.0.0.1:9; last seen 2" in line
     finally:
         end_all(name)
 

@@ -123,7 +123,9 @@ def test_where_nothing_is_recorded_status_says_since_when_it_counts(
 
 
 def test_a_run_was_last_seen_when_it_last_recorded(tmp_path: Path) -> None:
-    assert last_seen(tmp_path / "run") == f"{tmp_path}/run has no records of it"
+    assert last_seen(tmp_path / "run") == (
+        f"{tmp_path}/run has no records of it; give --connect if it runs elsewhere"
+    )
     recorded(tmp_path / "run", 70)
     at_s = time.mktime((2026, 11, 29, 1, 20, 5, 0, 0, -1))
     os.utime(tmp_path / "run" / "metrics.jsonl", (at_s, at_s))
