@@ -7,6 +7,7 @@ recent parameters acts better (BBF, Schwarzer et al. 2023; Averaged-DQN, Anschel
 import copy
 
 import torch
+from torch import Tensor
 
 from mrcdrl.common.model.q_network import QNetwork
 
@@ -30,6 +31,7 @@ class ParameterAverage:
     def update(self, online: QNetwork, learner_step: int, num_steps: int) -> None:
         """Take in the parameters that `num_steps` steps led to; learner_step: the number of all."""
         keep = min(self._decay, (1 + learner_step) / (10 + learner_step)) ** num_steps
-        averages, parameters = list(self.network.parameters()), list(online.parameters())
+        averages: list[Tensor] = list(self.network.parameters())
+        parameters: list[Tensor] = list(online.parameters())
         with torch.no_grad():
             torch._foreach_lerp_(averages, parameters, 1.0 - keep)

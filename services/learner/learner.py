@@ -89,8 +89,14 @@ class Learner:
         cls, config: Config, threads: int = 1, tuner: ThreadTuner | None = None
     ) -> Self:
         """The learner of a run; threads and tuner as in the constructor."""
-        shape = {"stack": config.arena.stack, "view_px": config.arena.view_px}
-        return cls(config.agent, config.learner, **shape, threads=threads, tuner=tuner)
+        return cls(
+            config.agent,
+            config.learner,
+            stack=config.arena.stack,
+            view_px=config.arena.view_px,
+            threads=threads,
+            tuner=tuner,
+        )
 
     def __repr__(self) -> str:
         return (
