@@ -33,11 +33,18 @@ class Evaluator:
     """The service: follows the weights, evaluates them, publishes the results."""
 
     def __init__(
-        self, config: Config, joining: Joining, session: Session, stop: StopSignal
+        self,
+        config: Config,
+        joining: Joining,
+        session: Session,
+        stop: StopSignal,
+        after_first: Callable[[], None] = lambda: None,
     ) -> None:
+        """after_first: called once the first evaluation is published."""
         keys, worker = joining.keys, joining.worker
         self._settings = config.evaluator
         self._stop = stop
+        self._after_first = after_first
         self._evaluator = WeightsEvaluator(config, worker)
         self._reader = WeightsReader(session, keys, self._evaluator.adopt)
         confirmer = WeightsEvaluator(confirming(config), worker)
@@ -71,6 +78,8 @@ class Evaluator:
             self._evaluations += 1
             self._publisher.put(encode(result))
             self._best.offer(weights, result)
+            if self._evaluations == 1:
+                self._after_first()
         self._busy = False
 
     def _newest_after(self, until_s: float) -> Weights | None:

@@ -9,7 +9,8 @@ from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.evaluator import Evaluator
 
-_NICE = 10  # evaluating yields to learning on shared cores
+# Evaluating yields to learning on shared cores; not at first, so that a short run has a result too.
+_NICE = 10
 
 
 def main(argv: Sequence[str]) -> int:
@@ -19,8 +20,7 @@ def main(argv: Sequence[str]) -> int:
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)
         torch.set_num_threads(config.evaluator.threads)
-        evaluator = Evaluator(config, joining, session, stop)
+        evaluator = Evaluator(config, joining, session, stop, lambda: yield_cores(_NICE))
         session.announce(joining.keys.live("evaluator", joining.worker))
-        yield_cores(_NICE)  # only now: a restart waits for the start-up
         evaluator.run()
     return 0
