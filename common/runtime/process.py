@@ -179,14 +179,14 @@ def last_line(log: Path, begin: int = 0) -> str:
 
 
 def yield_cores(nice: int, autogroup: Path = Path("/proc/self/autogroup")) -> None:
-    """Let other processes go first where cores are short: lower this process's priority.
+    """Set this process's priority: above 0, other processes go first where cores are short.
 
-    nice: 1 ... 19 more than now. Where Linux schedules sessions as groups
-    (sched_autogroup_enabled), a process's own value counts within its session only, and the
-    session's counts against others. A process that leads its session sets that too; another one
-    would slow its terminal down.
+    nice: 0 ... 19; a lower one than now needs the right to it, and is left out without. Where Linux
+    schedules sessions as groups (sched_autogroup_enabled), a process's own value counts within its
+    session only, and the session's counts against others. A process that leads its session sets
+    that too; another one would slow its terminal down.
     """
-    level = os.nice(nice)
-    if os.getsid(0) == os.getpid():
-        with contextlib.suppress(OSError):  # not Linux, no groups, or a limit of the system
-            autogroup.write_text(f"{level}\n", "ascii")
+    with contextlib.suppress(OSError):  # not Linux, no groups, or no right to it
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
+        if os.getsid(0) == os.getpid():
+            autogroup.write_text(f"{nice}\n", "ascii")

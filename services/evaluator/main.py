@@ -23,4 +23,5 @@ def main(argv: Sequence[str]) -> int:
         evaluator = Evaluator(config, joining, session, stop, lambda: yield_cores(_NICE))
         session.announce(joining.keys.live("evaluator", joining.worker))
         evaluator.run()
+        yield_cores(0)  # the end is not to wait for cores
     return 0
