@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import emit, spread
-from benchmarks.replay_load import counting_chunk
+from benchmarks.replay_load import MAX_COUNT, counting_chunk
 from mrcdrl.common.config import Config, TransportConfig, load_config, to_toml
 from mrcdrl.common.errors import DeadlineError
 from mrcdrl.common.transport import Session, free_endpoint
@@ -48,6 +48,7 @@ WRITERS = ("actor-0", "actor-1")
 DURING_RECOVERY = 5  # one kill in so many comes before the service is up
 CONFIG = {
     "arena.num_robots": "4",
+    "arena.success_reward": str(MAX_COUNT),  # rewards count transitions
     "actor.chunk_length": "50",
     "replay.sampler": "prioritized",
     "replay.min_size": "1000",

@@ -25,6 +25,7 @@ from mrcdrl.services.replay.client import PriorityWriter, ReplayReader, ReplayWr
 
 _WARN_S = 60.0
 _MOST_CHUNKS = 6  # in one request
+MAX_COUNT = 1_000_000  # rewards count so far, then from 0: the largest that settings allow
 
 
 def main() -> int:
@@ -90,7 +91,7 @@ def counting_chunk(config: Config, actor: str, incarnation: int, sequence: int) 
         weights_version=sequence,
         records=counts.view(np.uint8),
         actions=((first + np.arange(length)) % 3).astype(np.uint8),
-        rewards=((first + np.arange(length)) % 2**24).astype(np.float32),  # exact up to there
+        rewards=((first + np.arange(length)) % MAX_COUNT).astype(np.float32),
         discounts=np.full(length, 0.97, np.float32),
         bootstrap_offsets=np.full(length, config.agent.n_step, np.uint8),
         priorities=np.ones(length, np.float32),
@@ -105,7 +106,7 @@ def check_samples(config: Config, samples: Samples) -> None:
     now = counts[:, 0, 0].astype(np.int64)
     if not (
         (counts == window).all()
-        and (samples.rewards == now % 2**24).all()
+        and (samples.rewards == now % MAX_COUNT).all()
         and (samples.actions == now % 3).all()
         and ((now >= first) & (now < first + config.actor.chunk_length)).all()
     ):

@@ -36,4 +36,4 @@ def test_the_ordeal_would_notice() -> None:
     assert len(backwards("judged", orders, again=True)) == 2
     digests = {(1, 1): "one", (1, 2): "two"}
     acted = [((1, 1), "one"), ((1, 2), "one"), ((1, 3), "never heard of")]
-    assert mixed(acted, digests) == ["acted by (1, 2), and not as it was published"]
+    assert mixed(acted, digests) == ["acted by (1, 2), with other parameters than published"]
