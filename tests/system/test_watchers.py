@@ -4,7 +4,7 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -77,7 +77,8 @@ def test_a_run_outlives_the_reader_of_its_lines_in_a_locale_without_its_characte
     ]
     try:
         with (tmp_path / "err").open("wb") as err:
-            train = start([*arguments, "--run.minutes", "0.3"], subprocess.PIPE, err.fileno())
+            limits = ["--run.minutes", "0.3", "--learner-steps", "100000000"]
+            train = start([*arguments, *limits], subprocess.PIPE, err.fileno())
         assert train.stdout is not None
         line = train.stdout.readline().decode("ascii")
         train.stdout.close()
@@ -92,6 +93,15 @@ def test_a_run_outlives_the_reader_of_its_lines_in_a_locale_without_its_characte
         end_all(name)
 
 
+@pytest.fixture
+def heeded_hangups() -> Iterator[None]:
+    """Children heed SIGHUP, also where the tests themselves were started by nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("heeded_hangups")
 def test_status_tells_the_runs_time_and_a_closed_terminal_and_a_second_signal_end_it(
     tmp_path: Path,
 ) -> None:
