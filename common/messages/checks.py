@@ -4,7 +4,6 @@ Invariants: pure; a check returns the reason for which a message is refused, or 
 a process of ours sends is refused. What has passed needs no guard behind `decode`.
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -30,6 +29,7 @@ from mrcdrl.common.messages.trajectory import (
     Stats,
     Weights,
 )
+from mrcdrl.common.runtime.files import sha256
 from mrcdrl.common.runtime.names import MAX_NAME, is_name, printable
 
 Range = tuple[float, float]
@@ -189,7 +189,7 @@ def _check_lease_reply(reply: LeaseReply) -> str | None:
 
 
 def _check_weights(weights: Weights) -> str | None:
-    if hashlib.sha256(weights.payload).hexdigest() != weights.digest:
+    if sha256(weights.payload) != weights.digest:
         return "the payload does not match its digest: torn or altered"
     return None
 

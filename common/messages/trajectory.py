@@ -8,13 +8,14 @@ return, W = H + 1 + n records that one transition may touch, B = transitions of 
 K = robots of an arena, A = arenas, R = bytes of one observation record.
 """
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from typing import Any, Self
 
 import numpy as np
+
+from mrcdrl.common.runtime.files import sha256
 
 # Spelled out because numpy.typing.NDArray, an alias from 2.5 on, hides its dtype.
 UInt8Array = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
@@ -198,7 +199,7 @@ class Weights:
     @classmethod
     def of(cls, epoch: int, version: int, learner_step: int, payload: bytes) -> Self:
         """Make weights with the digest of the payload."""
-        return cls(epoch, version, learner_step, payload, hashlib.sha256(payload).hexdigest())
+        return cls(epoch, version, learner_step, payload, sha256(payload))
 
     @property
     def order(self) -> tuple[int, int]:

@@ -14,9 +14,7 @@ from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.q_network import precision
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import network_from_bytes
-from mrcdrl.common.runtime.files import BEST_WEIGHTS, RUN_CONFIG
-
-_MANIFEST = "manifest.json"  # of a checkpoint
+from mrcdrl.common.runtime.files import BEST_WEIGHTS, CHECKPOINT_MANIFEST, RUN_CONFIG
 
 
 def load_policy(source: str | Path, config: Config | None = None) -> Policy:
@@ -61,8 +59,8 @@ def config_beside(path: Path) -> str:
 def read_saved(path: Path) -> Weights:
     """Read weights, with version and learner step from the manifest beside them, or else 0."""
     payload, manifest = read_weights(path)
-    if not manifest and (path.parent / _MANIFEST).is_file():
-        manifest = json.loads((path.parent / _MANIFEST).read_bytes())
+    if not manifest and (path.parent / CHECKPOINT_MANIFEST).is_file():
+        manifest = json.loads((path.parent / CHECKPOINT_MANIFEST).read_bytes())
     return Weights.of(
         epoch=int(manifest.get("weights_epoch", 0)),
         version=int(manifest.get("weights_version", 0)),

@@ -11,6 +11,7 @@ from pathlib import Path
 TEMPORARY_SUFFIX = ".part"
 RUN_CONFIG = "config.toml"  # in a run directory, as BEST_WEIGHTS
 BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"
+CHECKPOINT_MANIFEST = "manifest.json"
 
 
 def write_synced(path: Path, content: bytes, mode: int = 0o644) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.runtime.files import (
+    CHECKPOINT_MANIFEST,
     TEMPORARY_SUFFIX,
     reason,
     sha256,
@@ -28,7 +29,6 @@ from mrcdrl.common.runtime.files import (
 from mrcdrl.services.learner.learner import LearnerState
 
 FORMAT_VERSION = 1
-MANIFEST = "manifest.json"
 _PREFIX = "step_"
 _FILES = ("model", "target", "optimizer")
 _AVERAGE = "average"
@@ -152,7 +152,7 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
     folder.mkdir()
     for name, data in contents.items():
         write_synced(folder / f"{name}.safetensors", data)
-    write_synced(folder / MANIFEST, json.dumps(manifest, indent=2).encode())
+    write_synced(folder / CHECKPOINT_MANIFEST, json.dumps(manifest, indent=2).encode())
     sync_directory(folder)
 
 
@@ -181,13 +181,15 @@ def _newest_first(directory: Path) -> list[Path]:
 
 def _read_manifest(path: Path) -> Mapping[str, Any]:
     try:
-        manifest = json.loads((path / MANIFEST).read_bytes())
+        manifest = json.loads((path / CHECKPOINT_MANIFEST).read_bytes())
     except OSError as error:
-        raise CheckpointError(f"checkpoint {path}: {MANIFEST}: {reason(error)}") from error
+        raise CheckpointError(
+            f"checkpoint {path}: {CHECKPOINT_MANIFEST}: {reason(error)}"
+        ) from error
     except ValueError as error:
-        raise CheckpointError(f"checkpoint {path}: {MANIFEST} is damaged") from error
+        raise CheckpointError(f"checkpoint {path}: {CHECKPOINT_MANIFEST} is damaged") from error
     if not isinstance(manifest, dict) or not isinstance(manifest.get("sha256"), dict):
-        raise CheckpointError(f"checkpoint {path}: {MANIFEST} is damaged")
+        raise CheckpointError(f"checkpoint {path}: {CHECKPOINT_MANIFEST} is damaged")
     if manifest.get("format_version") != FORMAT_VERSION:
         version = manifest.get("format_version")
         raise CheckpointError(f"checkpoint {path} has format {version!r}, not {FORMAT_VERSION}")

@@ -4,7 +4,6 @@ Invariant: a checkpoint's `weights_version` is at least as large as any version 
 the next checkpoint, so that a learner killed at any moment continues with a larger one.
 """
 
-import hashlib
 import logging
 import time
 from pathlib import Path
@@ -13,6 +12,7 @@ from mrcdrl.common.config import Config, to_toml
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.model.saved_policy import read_saved, weights_path
+from mrcdrl.common.runtime.files import sha256
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.learner import Learner
@@ -35,7 +35,7 @@ class WeightsPublisher:
         self._learner = learner
         self._writer = writer
         self._directory = directory
-        self._digest = hashlib.sha256(to_toml(config).encode()).hexdigest()
+        self._digest = sha256(to_toml(config).encode())
         self.epoch, self.version = time.time_ns(), 0
         self._restore()
         self._reserved = 0

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from tests.system.system_processes import (
-    SMALL,
     Command,
     Finished,
     end_all,
@@ -13,6 +12,7 @@ from tests.system.system_processes import (
     processes_of,
     run_name,
     shared_memory_of,
+    smoke_training,
 )
 
 
@@ -26,7 +26,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         mapped.update(shared_memory_of(name))
         return train.process.poll() is not None
 
-    arguments = ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
+    arguments = smoke_training(folder, name)
     with Command([*arguments, "--learner-steps", "60"], folder) as train:
         eventually(ended, "the run ends by itself", 600, pause_s=1.0)
         code = train.wait()

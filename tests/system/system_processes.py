@@ -37,6 +37,11 @@ def run_name(stem: str) -> str:
     return f"{stem}-{uuid.uuid4().hex[:12]}"
 
 
+def smoke_training(folder: Path, name: str) -> list[str | Path]:
+    """Arguments that train the smoke preset at its smallest, with its run in a folder."""
+    return ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
+
+
 def environment(**more: str) -> dict[str, str]:
     """This process's environment without settings of mrcdrl, plus more."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MRCDRL_")}

@@ -15,7 +15,6 @@ from safetensors.numpy import save
 from mrcdrl.common.transport import free_endpoint
 from mrcdrl.services.learner import checkpoint
 from tests.system.system_processes import (
-    SMALL,
     Command,
     Finished,
     end_all,
@@ -23,6 +22,7 @@ from tests.system.system_processes import (
     eventually,
     processes_of,
     run_name,
+    smoke_training,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -229,7 +229,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: Path) -> None:
     name = run_name("full")
     run = small_disk / name
-    arguments = ["train", "--config", "smoke", "--run-dir", small_disk, "--name", name, *SMALL]
+    arguments = smoke_training(small_disk, name)
     more = ["--learner-steps", "100000000", "--replay.fsync", "off"]
     try:
         with Command([*arguments, *more], tmp_path) as train:

@@ -20,13 +20,13 @@ from mrcdrl.common.transport import Presence, QueueSubscriber, Session
 from mrcdrl.common.transport.keys import Keys, role_and_worker
 from tests.system.system_processes import (
     PATIENCE_S,
-    SMALL,
     Command,
     end_all,
     error_line,
     eventually,
     processes_of,
     run_name,
+    smoke_training,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -72,7 +72,7 @@ class Live:
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """`mrcdrl train` without an evaluator of its own, up and learning."""
     folder, name = tmp_path_factory.mktemp("live"), run_name("live")
-    arguments = ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
+    arguments = smoke_training(folder, name)
     more = ["--run.evaluators", "0", "--learner-steps", "100000000"]
     more += ["--exploration.lease_s", "3"]
     note = folder / name / ENDPOINT_FILE

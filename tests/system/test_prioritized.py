@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.system_processes import SMALL, Command, end_all, processes_of, run_name
+from tests.system.system_processes import Command, end_all, processes_of, run_name, smoke_training
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
 
 def test_a_prioritized_run_ends_well_and_has_set_priorities(tmp_path: Path) -> None:
     name = run_name("prioritized")
-    arguments = ["train", "--config", "smoke", "--run-dir", tmp_path, "--name", name, *SMALL]
+    arguments = smoke_training(tmp_path, name)
     prioritized = ["--replay.sampler=prioritized", "--replay.importance_exponent_final=1.0"]
     brief = ["--learner-steps", "600", "--run.evaluators", "0"]
     try:

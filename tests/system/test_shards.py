@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from tests.system.system_processes import (
-    SMALL,
     Command,
     end_all,
     eventually,
     processes_of,
     run_name,
+    smoke_training,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -29,7 +29,7 @@ def last_metrics(run: Path) -> dict[str, float]:
 def test_training_goes_on_when_a_shard_is_killed(tmp_path: Path) -> None:
     name = run_name("shards")
     run = tmp_path / name
-    arguments = ["train", "--config", "smoke", "--run-dir", tmp_path, "--name", name, *SMALL]
+    arguments = smoke_training(tmp_path, name)
     # Room for the restart: the launcher takes one that lived for less than 10 s for broken.
     sharded = ["--replay.shards=2", "--actors=2", "--run.evaluators=0", "--learner-steps=100000"]
 

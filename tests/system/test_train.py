@@ -23,7 +23,6 @@ from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.monitor.records import read_episodes, read_evaluations, read_last_metrics
 from tests.system.system_processes import (
     PATIENCE_S,
-    SMALL,
     Command,
     Finished,
     end_all,
@@ -31,6 +30,7 @@ from tests.system.system_processes import (
     processes_of,
     run_name,
     shared_memory_of,
+    smoke_training,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -188,7 +188,7 @@ def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: P
     name = run_name("screen")
     run = tmp_path / name
     terminal = Terminal()
-    arguments = ["train", "--config", "smoke", "--run-dir", tmp_path, "--name", name, *SMALL]
+    arguments = smoke_training(tmp_path, name)
     command = Command(
         [*arguments, "--learner-steps", NEVER],
         tmp_path,

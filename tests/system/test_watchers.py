@@ -14,7 +14,6 @@ from mrcdrl.services.monitor.records import read_evaluations, read_last_metrics
 from tests.system.system_processes import (
     PATIENCE_S,
     REPOSITORY,
-    SMALL,
     Command,
     end_all,
     environment,
@@ -22,6 +21,7 @@ from tests.system.system_processes import (
     eventually,
     processes_of,
     run_name,
+    smoke_training,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -65,16 +65,7 @@ def test_a_run_outlives_the_reader_of_its_lines_in_a_locale_without_its_characte
 ) -> None:
     name = run_name("unread")
     run = tmp_path / name
-    arguments: list[str | Path] = [
-        "train",
-        "--config",
-        "smoke",
-        "--run-dir",
-        tmp_path,
-        "--name",
-        name,
-        *SMALL,
-    ]
+    arguments = smoke_training(tmp_path, name)
     try:
         with (tmp_path / "err").open("wb") as err:
             limits = ["--run.minutes", "0.3", "--learner-steps", "100000000"]
@@ -107,16 +98,7 @@ def test_status_tells_the_runs_time_and_a_closed_terminal_and_a_second_signal_en
 ) -> None:
     name = run_name("hung-up")
     run = tmp_path / name
-    arguments: list[str | Path] = [
-        "train",
-        "--config",
-        "smoke",
-        "--run-dir",
-        tmp_path,
-        "--name",
-        name,
-        *SMALL,
-    ]
+    arguments = smoke_training(tmp_path, name)
     asked: list[str | Path] = ["status", "--run", name, "--run-dir", tmp_path]
     try:
         with Command([*arguments, "--learner-steps", "100000000"], tmp_path) as train:

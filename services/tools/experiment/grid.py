@@ -4,7 +4,6 @@ Invariants: a cell's name depends on what its run learns by and is judged by, an
 neither on the environment nor on the commit. All cells are checked before the first one begins.
 """
 
-import hashlib
 import itertools
 import json
 import tomllib
@@ -15,6 +14,7 @@ from typing import Any
 
 from mrcdrl.common.config import Config, load_config, preset_names
 from mrcdrl.common.errors import ConfigError
+from mrcdrl.common.runtime.files import sha256
 from mrcdrl.common.runtime.names import check_name
 
 PROTOCOL = 1
@@ -58,7 +58,7 @@ class Cell:
             mode="json", exclude_defaults=True, exclude={"transport": True}
         )
         text = json.dumps([PROTOCOL, values], sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        return sha256(text.encode())
 
     @property
     def name(self) -> str:
