@@ -34,7 +34,8 @@ from mrcdrl.services.monitor.watching import Watching
 _TICK_S = 0.25
 _LISTEN_S = 3.0  # every service reports once a second, and two reports make a rate
 _JSON_PERIOD_S = 1.0
-_RECORDER_WAITS_S = 30.0  # for a run to come up
+_WAIT_S = 30.0  # of a watcher or recorder, for the run to come up
+_RETRY_S = 0.2
 _FRESH_S = 10.0  # records are of a run that is up if they are no older; one comes every second
 
 
@@ -83,19 +84,37 @@ def main(argv: Sequence[str]) -> int:
 def join(
     arguments: argparse.Namespace, stop: StopSignal, owned: ExitStack
 ) -> tuple[Joining, Session, Config]:
-    """Join the run; a recorder waits for it to come up, and whoever only looks does not.
+    """Join the run; who watches or records waits for it to come up, and says so at once.
 
     Raises UnreachableError, with what the run directory knows, if the run is not up.
     """
-    wait_s = _RECORDER_WAITS_S if arguments.record else 0.0
-    try:
-        joining = Joining.from_arguments(arguments)
-        session = owned.enter_context(Session(joining.transport, open_timeout_s=wait_s))
-        return joining, session, fetch_config(session, joining, stop, wait_s)
-    except (UnreachableError, DeadlineError) as error:
-        seen = last_seen(arguments.run_dir / arguments.run)
-        why = str(error).partition(";")[0]
-        raise UnreachableError(f"run {arguments.run} is not up: {why}; {seen}") from error
+    wait_s = _WAIT_S if arguments.watch or arguments.record else 0.0
+    deadline, told = time.monotonic() + wait_s, False
+    while True:
+        try:
+            return _join_now(arguments, stop, owned)
+        except UnreachableError as error:
+            if time.monotonic() >= deadline or stop.wait(_RETRY_S):
+                raise
+            if not told:
+                sys.stderr.write(f"mrcdrl: {error}; waiting up to {wait_s:.0f} s for it\n")
+                told = True
+
+
+def _join_now(
+    arguments: argparse.Namespace, stop: StopSignal, owned: ExitStack
+) -> tuple[Joining, Session, Config]:
+    with ExitStack() as opened:
+        try:
+            joining = Joining.from_arguments(arguments)
+            session = opened.enter_context(Session(joining.transport, open_timeout_s=0.0))
+            config = fetch_config(session, joining, stop, 0.0)
+        except (UnreachableError, DeadlineError) as error:
+            seen = last_seen(arguments.run_dir / arguments.run)
+            why = str(error).partition(";")[0]
+            raise UnreachableError(f"run {arguments.run} is not up: {why}; {seen}") from error
+        owned.push(opened.pop_all())
+        return joining, session, config
 
 
 def last_seen(run_dir: Path) -> str:

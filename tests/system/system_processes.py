@@ -135,6 +135,12 @@ def eventually(
     return found
 
 
+def serves(replay: Command) -> None:
+    """Wait until a replay process answers: who joins waits for it as long as a person would."""
+    eventually(lambda: "replay: serving" in replay.err or replay.process.poll(), "replay serves")
+    assert replay.process.poll() is None, replay.err
+
+
 def processes_of(*words: str) -> dict[int, str]:
     """Process id to command line of all other processes with these words in theirs."""
     found = {}

@@ -13,7 +13,15 @@ from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.learner import LearnerState
-from tests.system.system_processes import SMALL, Command, end_all, eventually, run_name
+from tests.system.system_processes import (
+    PATIENCE_S,
+    SMALL,
+    Command,
+    end_all,
+    eventually,
+    run_name,
+    serves,
+)
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
@@ -43,10 +51,12 @@ class Run:
         serving = ["--config", "smoke", "--listen", self.endpoint, *TURNS]
         joining = ["--connect", self.endpoint, "--id", f"{role}-0"]
         with Command([*here, *(serving if role == "replay" else joining)], self.folder) as command:
+            if role == "replay":
+                serves(command)
             yield command
 
     def session(self) -> Session:
-        return Session(TransportConfig(connect=(self.endpoint,)), open_timeout_s=120)
+        return Session(TransportConfig(connect=(self.endpoint,)), open_timeout_s=PATIENCE_S)
 
     def final(self) -> LearnerState:
         loaded = checkpoint.load_latest(self.folder / self.name / "checkpoints")

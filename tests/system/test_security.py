@@ -19,7 +19,7 @@ from mrcdrl.common.errors import DeadlineError, EndpointError
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.certificates import make
-from tests.system.system_processes import SMALL, Command, eventually, run_name
+from tests.system.system_processes import SMALL, Command, eventually, run_name, serves
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
@@ -152,6 +152,7 @@ def test_a_run_trains(secured: Secured, tmp_path: Path) -> None:
     with ExitStack() as started:
         smoke = ("--config", "smoke", "--run.learner_steps", "0", *SMALL)
         replay = started.enter_context(command("replay", *smoke))
+        serves(replay)
         learner = started.enter_context(command("learner"))
         others = [started.enter_context(command(role)) for role in ("actor", "evaluator")]
         watching = started.enter_context(command("status", "--watch", "--json"))

@@ -3,12 +3,14 @@
 import json
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from mrcdrl.common.config import Config, TransportConfig
-from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.config import Config, TransportConfig, to_toml
+from mrcdrl.common.errors import RunDirectoryError, UnreachableError
 from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.files import RUN_CONFIG
@@ -22,7 +24,7 @@ from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.screen import plain_line
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
-from mrcdrl.services.status.main import last_seen, listen, recall, status
+from mrcdrl.services.status.main import join, last_seen, listen, parser, recall, status
 
 
 def test_status_without_processes() -> None:
@@ -130,3 +132,41 @@ def test_a_run_was_last_seen_when_it_last_recorded(tmp_path: Path) -> None:
     at_s = time.mktime((2026, 11, 29, 1, 20, 5, 0, 0, -1))
     os.utime(tmp_path / "run" / "metrics.jsonl", (at_s, at_s))
     assert last_seen(tmp_path / "run") == "last seen 2026-11-29 01:20:05, 0:01:10 after it began"
+
+
+def test_who_watches_a_run_that_is_not_up_is_told_at_once_and_waits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mrcdrl.services.status.main._WAIT_S", 600.0)  # cores may be short
+    endpoint = free_endpoint()
+    asked = ["--run", "late", "--run-dir", str(tmp_path), "--connect", endpoint, "--watch"]
+    with ExitStack() as owned, ThreadPoolExecutor(1) as other:
+        joined = other.submit(join, parser().parse_args(asked), StopSignal(), owned)
+        said = ""
+        while "waiting" not in said and not joined.done():
+            said += capsys.readouterr().err
+            time.sleep(0.01)
+        with Session(TransportConfig(listen=(endpoint,))) as replay:
+            server = replay.server(Keys("late").config)
+            while not joined.done():
+                request = server.take(0.05)
+                if request is not None:
+                    request.reply(to_toml(Config()).encode())
+            _, _, config = joined.result()
+            owned.close()
+    assert said.startswith(f"mrcdrl: run late is not up: nobody answers at {endpoint}")
+    assert said.endswith("; waiting up to 600 s for it\n")
+    assert config.agent == Config().agent
+
+
+@pytest.mark.parametrize("how", ["looks once", "watches, and is told to stop"])
+def test_who_does_not_wait_for_a_run_is_told_why_it_is_not_up(
+    how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked, stop = ["--run", "gone", "--run-dir", str(tmp_path)], StopSignal()
+    if how != "looks once":
+        asked.append("--watch")
+        stop.set()
+    with ExitStack() as owned, pytest.raises(UnreachableError, match="run gone is not up: no run"):
+        join(parser().parse_args(asked), stop, owned)
+    assert capsys.readouterr().err == ""
