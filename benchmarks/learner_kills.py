@@ -38,6 +38,7 @@ from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.evaluator.evaluator import WeightsEvaluator
+from tests.patience import PATIENCE_S
 from tests.system.system_processes import Command, end_all, eventually, run_name
 
 SMALL_RUN = (
@@ -116,7 +117,7 @@ def ordeal(
     try:
         with (
             Command(["replay", *here, "--listen", endpoint, *configured], folder),
-            Session(TransportConfig(connect=(endpoint,)), open_timeout_s=120) as session,
+            Session(TransportConfig(connect=(endpoint,)), open_timeout_s=PATIENCE_S) as session,
             ExitStack() as running,
         ):
             running.enter_context(process("actor"))

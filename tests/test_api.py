@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import mrcdrl
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(set(mrcdrl.__all__) - {"__version__"})
@@ -38,7 +39,7 @@ value = mrcdrl.{name}
 assert value is sys.modules["{module}"].{name}
 assert vars(mrcdrl)["{name}"] is value
 """
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=100)
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=PATIENCE_S)
 
 
 def test_type_checkers_see_every_name() -> None:

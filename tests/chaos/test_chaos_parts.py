@@ -28,6 +28,7 @@ from tests.chaos.chaos_faults import (
 )
 from tests.chaos.chaos_hosts import Host, hosts, owned_name, run
 from tests.chaos.chaos_observer import Life, Observer, compare
+from tests.patience import PATIENCE_S
 from tests.system.system_processes import REPOSITORY, environment, eventually
 
 SIZE, PORT = 100_000, 7000
@@ -68,7 +69,10 @@ def two_hosts() -> Iterator[tuple[Host, Host, str]]:
 def reaches(host: Host, address: str, patience_s: float = 1.0) -> bool:
     """Whether all bytes arrive, each at most `patience_s` after the one before."""
     command = [*host.prefix, sys.executable, "-c", CLIENT, address, str(patience_s)]
-    return subprocess.run(command, capture_output=True, timeout=60, check=False).returncode == 0
+    return (
+        subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False).returncode
+        == 0
+    )
 
 
 @pytest.mark.usefixtures("_hosts")

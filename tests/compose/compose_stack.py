@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tests.patience import PATIENCE_S
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 BASE = REPOSITORY / "docker-compose.yml"
 SMOKE = Path(__file__).with_name("smoke.yml")
@@ -35,7 +37,7 @@ def works(environment: Mapping[str, str]) -> bool:
     try:
         for command in (["docker", "compose", "version"], ["docker", "info"]):
             subprocess.run(
-                command, env=dict(environment), capture_output=True, check=True, timeout=30
+                command, env=dict(environment), capture_output=True, check=True, timeout=PATIENCE_S
             )
     except (OSError, subprocess.SubprocessError):
         return False
@@ -66,11 +68,11 @@ def engine(folder: Path) -> Iterator[dict[str, str]]:
                 capture_output=True,
                 text=True,
                 check=True,
-                timeout=10,
+                timeout=PATIENCE_S,
             )
             yield dict(line.split("=", 1) for line in shown.stdout.split("\0") if line)
         finally:
-            subprocess.run([script, "down"], env=environment, check=True, timeout=120)
+            subprocess.run([script, "down"], env=environment, check=True, timeout=PATIENCE_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +95,12 @@ class Stack:
         self._head = ["docker", "compose", "--project-name", self.project]
         self._head += [word for file in (BASE, *overrides) for word in ("--file", str(file))]
 
-    def compose(self, *arguments: str, timeout_s: float = 120.0) -> str:
+    def compose(self, *arguments: str, timeout_s: float = PATIENCE_S) -> str:
         """Output of the command; a failure shows all of it."""
         return self._run([*self._head, *arguments], timeout_s)
 
     def docker(self, *arguments: str) -> str:
-        return self._run(["docker", *arguments], 60.0)
+        return self._run(["docker", *arguments], PATIENCE_S)
 
     def containers(self, service: str) -> list[Container]:
         """Containers of a service, stopped ones included, sorted by id."""
@@ -148,7 +150,7 @@ class Stack:
         return found
 
     def remove(self) -> None:
-        self.compose("down", "--volumes", "--timeout", "5", timeout_s=180)
+        self.compose("down", "--volumes", "--timeout", "5", timeout_s=PATIENCE_S)
 
     def left(self) -> list[str]:
         """Containers, volumes and networks with the project's name."""

@@ -26,14 +26,14 @@ from mrcdrl.services.tools.certificates import make
 HOST, PORT = "router", 7447
 CERTIFICATES = Path("/certs")
 KEYS = Keys("stack")
-PATIENCE_S = 90.0
+PATIENCE_S = 240.0  # less than those who wait for it have
 
 
-def join(folder: Path, **other: str) -> Session:
+def join(folder: Path, wait_s: float = PATIENCE_S, **other: str) -> Session:
     files = {name: str(folder / f"{name}.pem") for name in ("ca", "certificate", "key")}
     endpoint = f"tls/{HOST}:{PORT}"
     config = TransportConfig(connect=(endpoint,), timeout_s=5.0, **(files | other))
-    return Session(config, open_timeout_s=0.0)
+    return Session(config, open_timeout_s=wait_s)
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def with_a_foreign_authority(folder: Path) -> None:
     make(folder, ["learner"], [HOST], timedelta(days=1))
     ca = str(CERTIFICATES / "learner" / "ca.pem")
     with refused(EndpointError, "does not accept this certificate"):
-        join(folder / "learner", ca=ca).close()
+        join(folder / "learner", 0.0, ca=ca).close()
 
 
 def in_no_role(folder: Path) -> None:

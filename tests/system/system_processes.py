@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from mrcdrl.common.runtime.process import COMMAND
+from tests.patience import PATIENCE_S
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PATIENCE_S = 300.0  # enough on a loaded machine for what takes five seconds on an idle one
 T = TypeVar("T")
 
 # Every part at its smallest: images of 32 px, short episodes.
@@ -100,10 +100,10 @@ class Command:
         if self.process.poll() is None:
             self.process.terminate()
             try:
-                return self.process.wait(30)
+                return self.process.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
                 self.process.kill()
-        return self.process.wait(30)
+        return self.process.wait(PATIENCE_S)
 
 
 @dataclass(frozen=True, slots=True)

@@ -218,7 +218,7 @@ def test_every_transition_arrives_once_whole_and_in_order(
     try:
         with (
             Command([*serving, "--run-dir", tmp_path], tmp_path) as replay,
-            Session(TransportConfig(connect=(endpoint,))) as session,
+            Session(TransportConfig(connect=(endpoint,)), open_timeout_s=PATIENCE_S) as session,
         ):
             listener = Listener(session.queue_subscriber(keys.every_stats))
             writer = WeightsWriter(session, keys)

@@ -87,7 +87,7 @@ def test_it_reads_weights_and_follows_evaluations(tmp_path: Path) -> None:
     printed = tmp_path / "printed"
     with (
         Command([*served, "--config", "smoke"], tmp_path),
-        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=30.0) as session,
+        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=PATIENCE_S) as session,
         printed.open("wb") as output,
     ):
         asked = session.server(keys.weights)
@@ -111,5 +111,5 @@ def test_it_reads_weights_and_follows_evaluations(tmp_path: Path) -> None:
             eventually(both, f"the client shows both: {printed}", pause_s=0.2)
         finally:
             client.terminate()
-            client.wait(30)
+            client.wait(PATIENCE_S)
     assert printed.read_text("utf-8").startswith("weights 3 duel [")

@@ -12,6 +12,7 @@ from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import decode
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
+from tests.patience import PATIENCE_S
 from tests.system.system_processes import Command, eventually, processes_of, run_name
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -50,7 +51,7 @@ def test_a_run_that_is_up_gets_what_is_acknowledged_and_no_weights(tmp_path: Pat
     load += ["--rate", "2000", "--run", run, "--connect", endpoint]
     with (
         Command([*replay, "--config", "quick"], tmp_path),
-        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=120) as session,
+        Session(TransportConfig(connect=(endpoint,)), open_timeout_s=PATIENCE_S) as session,
     ):
         stats = session.queue_subscriber(Keys(run).every_stats)
         there = session.presence(Keys(run).everyone("actor"))

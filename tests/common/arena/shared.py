@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from mrcdrl.common.arena import Start
+from tests.patience import PATIENCE_S
 
 REPOSITORY = Path(__file__).parents[3]
 TARGETS = np.array([[175.0, 300.0], [425.0, 300.0]])  # the fixed layout for two
@@ -35,4 +36,4 @@ def in_another_process(file: str, expression: str) -> str:
     """Evaluates an expression with the names of a test file; returns its value as a string."""
     code = f"import runpy; print(eval({expression!r}, runpy.run_path({file!r})))"
     command = [sys.executable, "-c", code]
-    return subprocess.check_output(command, cwd=REPOSITORY, text=True, timeout=100).strip()
+    return subprocess.check_output(command, cwd=REPOSITORY, text=True, timeout=PATIENCE_S).strip()

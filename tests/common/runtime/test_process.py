@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_S
+
 STUCK = """
 import sys, threading
 from mrcdrl.common.runtime.process import StopSignal
@@ -55,7 +57,7 @@ print(stop.is_set(), stop.cause)
 @pytest.mark.parametrize(("before", "told"), [("SIG_DFL", "True SIGHUP"), ("SIG_IGN", "False ")])
 def test_a_closed_terminal_stops_a_process_unless_nohup_started_it(before: str, told: str) -> None:
     command = [sys.executable, "-c", HUNG_UP, before]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     assert result.stdout == f"{told}\n"
 
 
@@ -65,7 +67,10 @@ def test_a_command_starts_with_its_output_closed(closed: str) -> None:
     says += "sys.exit(run_main(lambda: print('–', flush=True) or 5))"
     command = ["sh", "-c", f'exec "$0" -c "$1" {closed}', sys.executable, says]
     result = subprocess.run(
-        command, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"}, timeout=60
+        command,
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        timeout=PATIENCE_S,
     )
     assert result.returncode == 5
     assert result.stdout == (b"" if closed.startswith(">&-") else b"\\u2013\n")

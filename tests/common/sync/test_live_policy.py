@@ -2,6 +2,7 @@
 
 import importlib.util
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from mrcdrl.common.sync.live_policy import LivePolicy
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
+from tests.patience import PATIENCE_S
 
 RUN = "followed"
 SMALL = {"arena.view_px": "32", "arena.max_frames": "20", "learner.precision": "float32"}
@@ -74,13 +76,13 @@ def adopted(policy: LivePolicy, version: int) -> None:
 
 
 def act_until(policy: LivePolicy, reached: Callable[[], bool]) -> None:
-    pause = threading.Event()
-    for _ in range(300):
+    pause, deadline = threading.Event(), time.monotonic() + PATIENCE_S
+    while True:
         policy.act(images(0))
         if reached():
             return
+        assert time.monotonic() < deadline, f"still {policy}"
         pause.wait(0.1)
-    raise AssertionError(f"still {policy}")
 
 
 def test_it_acts_on_stacks_by_the_newest_weights(run: Run) -> None:

@@ -18,6 +18,7 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
+from tests.patience import PATIENCE_S
 
 MESSAGES = st.tuples(
     st.integers(0, 2),  # epoch
@@ -211,7 +212,7 @@ def test_a_reader_that_hears_nothing_asks_the_learner() -> None:
         reader = WeightsReader(actor, keys, silence_s=0.1)
         for version in (1, 2):
             newest = Weights.of(0, version, 10 * version, payload_of(0, version))
-            found, deadline = None, time.monotonic() + 60
+            found, deadline = None, time.monotonic() + PATIENCE_S
             while found is None:
                 assert time.monotonic() < deadline, f"version {version} was not asked for"
                 request = server.take(0.05)

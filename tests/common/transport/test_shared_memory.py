@@ -24,8 +24,8 @@ from mrcdrl.common.transport.shared_memory import (
     room,
 )
 from tests.common.transport.test_transport import until_served
+from tests.patience import PATIENCE_S
 
-_DEADLINE_S = 20.0
 KEY = "mrcdrl/slots/query"
 LARGE = bytes(range(256)) * (LARGE_BYTES // 128)
 SMALL = b"small"
@@ -146,7 +146,7 @@ class Pair:
 
     def exchange(self, request: bytes, reply: bytes) -> tuple[bytes, bytes, Request]:
         """What the server and the client got."""
-        taken = self.thread.submit(self.server.take, _DEADLINE_S)
+        taken = self.thread.submit(self.server.take, PATIENCE_S)
         pending = self.client.ask(request, reply_bytes=len(reply))
         asked = taken.result()
         assert asked is not None
@@ -228,7 +228,7 @@ def test_a_buffer_that_is_out_of_reach_later_makes_the_client_ask_over_the_netwo
     with monkeypatch.context() as patched:
         patched.setattr("mrcdrl.common.transport.shared_memory._is_buffer", lambda _: False)
         pair.server._buffers = OpenedBuffers()
-        taken = pair.thread.submit(pair.server.take, _DEADLINE_S)
+        taken = pair.thread.submit(pair.server.take, PATIENCE_S)
         pending = pair.client.ask(LARGE)
         assert taken.result() is None
         with pytest.raises(ThrottledError, match="another container or user"):
@@ -245,9 +245,9 @@ def test_a_buffer_whose_answer_did_not_come_is_not_reused(pair: Pair) -> None:
     with pytest.raises(DeadlineError):
         silent.result()
     silent.release()
-    late = pair.server.take(_DEADLINE_S)
+    late = pair.server.take(PATIENCE_S)
     assert late is not None
-    pair.client._timeout_s = _DEADLINE_S
+    pair.client._timeout_s = PATIENCE_S
     got, answer, _ = pair.exchange(LARGE[::-1], LARGE)
     assert bytes(late.payload) == LARGE
     assert (got, answer) == (LARGE[::-1], LARGE)
@@ -282,6 +282,6 @@ def test_two_processes_share_memory() -> None:
                 assert request is not None
                 payloads.append(request.payload)
                 request.reply(bytes(request.payload)[::-1])
-            out, err = process.communicate(timeout=60)
+            out, err = process.communicate(timeout=PATIENCE_S)
     assert (out, process.returncode) == ("True\n" * 3, 0), err
     assert [type(payload) for payload in payloads] == [bytes, memoryview, memoryview]

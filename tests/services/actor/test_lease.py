@@ -17,6 +17,7 @@ from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.actor.lease import ALONE, ExplorationRank, LeaseClient
 from mrcdrl.services.replay.leases import LeaseTable
+from tests.patience import PATIENCE_S
 from tests.system.system_processes import REPOSITORY, Command, end_all, eventually, run_name
 
 RENEWED_S = 1.0  # as if leases were so short
@@ -220,7 +221,7 @@ class Holder:
 
     def end(self) -> None:
         self.process.kill()
-        self.process.wait(30)
+        self.process.wait(PATIENCE_S)
 
 
 @pytest.mark.system
@@ -249,7 +250,7 @@ def test_no_two_processes_hold_a_slot_whatever_happens_to_them(tmp_path: Path) -
             eventually(lambda: "none" in first.lines[written:], "it knows that it lost its slot")
             given_slot = second.slot
             second.process.send_signal(signal.SIGTERM)
-            assert second.process.wait(60) == 0
+            assert second.process.wait(PATIENCE_S) == 0
             eventually(lambda: first.slot == given_slot, "it has the slot that was given back")
             replay.process.kill()
             replay.wait()

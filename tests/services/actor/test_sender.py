@@ -13,8 +13,7 @@ from mrcdrl.common.errors import RefusedError
 from mrcdrl.common.messages.trajectory import Chunk, InsertReply
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.actor.sender import Sender
-
-_DEADLINE_S = 20.0
+from tests.patience import PATIENCE_S
 
 
 @dataclass
@@ -33,13 +32,13 @@ class FakeWriter:
             self.inserted.put(chunk.sequence)
         self.requests += 1
         if not self.prompt:
-            assert self.go_on.acquire(timeout=_DEADLINE_S)
+            assert self.go_on.acquire(timeout=PATIENCE_S)
         if self.refuses:
             raise RefusedError("replay refused: another arena")
         return None if self.stopped else InsertReply(chunks[-1].sequence, False, 0)
 
     def next(self) -> int:
-        return self.inserted.get(timeout=_DEADLINE_S)
+        return self.inserted.get(timeout=PATIENCE_S)
 
 
 def chunk(sequence: int, length: int = 3) -> Chunk:
@@ -72,7 +71,7 @@ def test_chunks_leave_in_order_and_are_counted() -> None:
     writer = FakeWriter()
     with sending(writer) as sender:
         for sequence in range(20):
-            assert sender.put(chunk(sequence), _DEADLINE_S)
+            assert sender.put(chunk(sequence), PATIENCE_S)
         assert [writer.next() for _ in range(20)] == list(range(20))
     assert (sender.chunks, sender.transitions, sender.spooled) == (20, 60, 0)
 
@@ -80,7 +79,7 @@ def test_chunks_leave_in_order_and_are_counted() -> None:
 def test_a_full_spool_makes_put_wait_and_drops_nothing() -> None:
     writer = FakeWriter(prompt=False)
     with sending(writer, spool_chunks=2) as sender:
-        assert sender.put(chunk(0), _DEADLINE_S)
+        assert sender.put(chunk(0), PATIENCE_S)
         assert writer.next() == 0  # taken out of the spool, not acknowledged
         assert sender.put(chunk(1), 0.0)
         assert sender.put(chunk(2), 0.0)
@@ -88,7 +87,7 @@ def test_a_full_spool_makes_put_wait_and_drops_nothing() -> None:
         assert sender.chunks == 0
         writer.go_on.release()
         assert writer.next() == 1
-        assert sender.put(chunk(3), _DEADLINE_S)
+        assert sender.put(chunk(3), PATIENCE_S)
     assert [writer.next() for _ in range(2)] == [2, 3]
     assert sender.chunks == 4
 
@@ -124,7 +123,7 @@ def test_a_full_spool_is_waited_for() -> None:
 def test_all_that_waits_leaves_at_once() -> None:
     writer = FakeWriter(prompt=False)
     with sending(writer) as sender:
-        assert sender.put(chunk(0), _DEADLINE_S)
+        assert sender.put(chunk(0), PATIENCE_S)
         assert writer.next() == 0
         for sequence in range(1, 6):
             assert sender.put(chunk(sequence), 0.0)
@@ -139,7 +138,7 @@ def test_close_sends_what_is_spooled_and_ends_the_thread() -> None:
     before = threading.active_count()
     sender = Sender(writer, 8)  # type: ignore[arg-type]
     for sequence in range(5):
-        sender.put(chunk(sequence), _DEADLINE_S)
+        sender.put(chunk(sequence), PATIENCE_S)
     sender.close()
     assert sender.chunks == 5
     assert threading.active_count() == before
@@ -158,7 +157,7 @@ def raises_soon(act: Callable[[], object]) -> RefusedError | None:
 def test_replays_refusal_reaches_the_actor() -> None:
     writer = FakeWriter(refuses=True)
     with sending(writer, spool_chunks=1) as sender:
-        sender.put(chunk(0), _DEADLINE_S)
+        sender.put(chunk(0), PATIENCE_S)
         error = raises_soon(lambda: sender.put(chunk(1), 0.1))
         assert str(error) == "replay refused: another arena"
         with pytest.raises(RefusedError, match="another arena"):
@@ -169,6 +168,6 @@ def test_replays_refusal_reaches_the_actor() -> None:
 def test_a_writer_that_was_stopped_ends_the_sending() -> None:
     writer = FakeWriter(stopped=True)
     with sending(writer) as sender:
-        sender.put(chunk(0), _DEADLINE_S)
+        sender.put(chunk(0), PATIENCE_S)
         assert writer.next() == 0
     assert sender.chunks == 0

@@ -2,6 +2,7 @@
 
 import queue
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,8 +15,7 @@ from mrcdrl.common.errors import RefusedError
 from mrcdrl.common.messages.trajectory import Priorities, PrioritiesReply
 from mrcdrl.services.learner import priorities
 from mrcdrl.services.learner.priorities import PrioritiesSender
-
-_DEADLINE_S = 20.0
+from tests.patience import PATIENCE_S
 
 
 @dataclass
@@ -29,13 +29,13 @@ class FakeWriter:
 
     def update(self, priorities: Priorities) -> PrioritiesReply | None:
         self.sent.put(priorities)
-        assert self.go_on.acquire(timeout=_DEADLINE_S)
+        assert self.go_on.acquire(timeout=PATIENCE_S)
         if self.refuses:
             raise RefusedError("replay refused: a priority is negative or not finite")
         return None if self.away else PrioritiesReply(len(priorities.keys), 0)
 
     def next(self) -> Priorities:
-        return self.sent.get(timeout=_DEADLINE_S)
+        return self.sent.get(timeout=PATIENCE_S)
 
 
 @contextmanager
@@ -75,7 +75,7 @@ def test_what_follows_soon_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_enough_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(priorities, "_GATHER_S", 2 * _DEADLINE_S)
+    monkeypatch.setattr(priorities, "_GATHER_S", 2 * PATIENCE_S)
     monkeypatch.setattr(priorities, "_GATHER_BATCHES", 3)
     writer = FakeWriter()
     with sending(writer) as sender:
@@ -121,7 +121,7 @@ def test_replays_refusal_reaches_the_learner() -> None:
         put(sender, 1)
         writer.next()
         writer.go_on.release()
-        sender._thread.join(_DEADLINE_S)
+        sender._thread.join(PATIENCE_S)
         with pytest.raises(RefusedError, match="negative or not finite"):
             put(sender, 2)
 
@@ -141,10 +141,10 @@ def test_errors_that_are_not_finite_stay_here() -> None:
     writer = FakeWriter()
     with sending(writer) as sender:
         sender.put(np.array([1, 2]), torch.tensor([torch.nan, 1.0]))
-        for _ in range(200):
-            if sender.dropped:
-                break
-            threading.Event().wait(0.05)
+        deadline = time.monotonic() + PATIENCE_S
+        while not sender.dropped:
+            assert time.monotonic() < deadline
+            threading.Event().wait(0.01)
         assert sender.dropped == 1
         put(sender, 3)
         assert writer.next().keys.tolist() == [30, 31]

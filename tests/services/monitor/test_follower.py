@@ -14,6 +14,7 @@ from mrcdrl.common.transport.keys import Keys, role_and_worker
 from mrcdrl.services.monitor.follower import Follower
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
+from tests.patience import PATIENCE_S
 
 KEYS = Keys("followed")
 CONFIG = Config(run=RunConfig(target_success_rate=0.9))
@@ -36,7 +37,7 @@ def session() -> Iterator[Session]:
 
 
 def listen_until(follower: Follower, heard: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + PATIENCE_S
     while not heard():
         assert time.monotonic() < deadline
         follower.listen(0.05)

@@ -10,6 +10,7 @@ from mrcdrl.common.config import Config, load_config, variable
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
+from tests.patience import PATIENCE_S
 
 CONFIG = load_config("smoke", {"arena.num_robots": "3"}, {})
 
@@ -78,7 +79,7 @@ def test_of_many_that_resume_at_once_one_does(path: Path) -> None:
     together, taken, refused = threading.Barrier(4), [], []
 
     def resume() -> None:
-        together.wait(20)
+        together.wait(PATIENCE_S)
         try:
             taken.append(RunDirectory.resume(path, {}))
         except RunDirectoryError:

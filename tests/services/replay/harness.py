@@ -17,8 +17,8 @@ from mrcdrl.services.replay.limiter import RateLimiter
 from mrcdrl.services.replay.log import open_log
 from mrcdrl.services.replay.service import ReplayService
 from mrcdrl.services.replay.table import Table
+from tests.patience import PATIENCE_S
 
-DEADLINE_S = 20.0  # for what should happen at once
 LENGTH = 16  # transitions of a chunk
 
 Answer = tuple[str, bytes | str]  # "reply", "refuse" or "throttle", and its payload or reason
@@ -94,7 +94,7 @@ class FakeRequest:
 
     def answer(self) -> Answer:
         """The next answer, which must come soon."""
-        return self.answers.get(timeout=DEADLINE_S)
+        return self.answers.get(timeout=PATIENCE_S)
 
 
 def start(directory: Path, config: Config = CONFIG) -> ReplayService:

@@ -29,7 +29,7 @@ from mrcdrl.services.replay.limiter import RateLimiter
 from mrcdrl.services.replay.sampler import PrioritizedSampler, UniformSampler
 from mrcdrl.services.replay.service import ReplayService
 from mrcdrl.services.replay.table import Table
-from tests.services.replay.harness import DEADLINE_S, Answer, FakeRequest, make_chunk
+from tests.services.replay.harness import PATIENCE_S, Answer, FakeRequest, make_chunk
 
 LENGTH, BATCH = 5, 4
 
@@ -100,7 +100,7 @@ def replay(
     min_size: int = 10,
     ratio: float = 0.0,
     buffer: float = 0.0,
-    hold_s: float = DEADLINE_S,
+    hold_s: float = PATIENCE_S,
     prioritized: bool = False,
     turn_size: int = 0,
 ) -> Iterator[Replay]:
@@ -404,7 +404,7 @@ def test_stop_answers_waiting_requests_and_ends_the_threads() -> None:
         waiting = up.samples.ask(encode(SampleRequest(BATCH)))
         before = time.monotonic()
         up.service.stop()
-        assert time.monotonic() - before < DEADLINE_S
+        assert time.monotonic() - before < PATIENCE_S
         assert not up.service.healthy
         if waiting.answers.qsize():
             assert waiting.answer()[0] == "throttle"

@@ -18,6 +18,7 @@ from mrcdrl.common.messages.trajectory import Float64Array
 from mrcdrl.services.replay.sampler import priorities_of
 from mrcdrl.services.replay.service import ReplayService
 from mrcdrl.services.replay.snapshot import Settings, Snapshot, SnapshotWriter, read_snapshot
+from tests.patience import PATIENCE_S
 from tests.services.replay.harness import (
     CONFIG,
     LENGTH,
@@ -287,7 +288,7 @@ def test_one_is_written_every_period(tmp_path: Path) -> None:
     writer.start()
     try:
         for _ in range(3):
-            assert taken.acquire(timeout=20)
+            assert taken.acquire(timeout=PATIENCE_S)
     finally:
         writer.stop()
     assert read_snapshot(tmp_path) is not None

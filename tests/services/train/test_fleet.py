@@ -16,8 +16,7 @@ from mrcdrl.common.runtime import process
 from mrcdrl.services.monitor.watching import Watching
 from mrcdrl.services.train import fleet as fleet_module
 from mrcdrl.services.train.fleet import Fleet
-
-_DEADLINE_S = 60.0
+from tests.patience import PATIENCE_S
 
 _WAITS = """
 import os, signal, sys
@@ -129,7 +128,7 @@ def test_a_process_that_ignores_the_signal_is_killed(
 def test_a_process_that_fails_at_once_ends_the_run_with_its_reason(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", _DEADLINE_S)
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", PATIENCE_S)
     put(beside, "actor", _FAILS)
     fleet.start("actor", "actor-0", [])
     with pytest.raises(MrcdrlError, match=r"actor-0 failed: mrcdrl: no such arena .log: .*actor-0"):
@@ -139,7 +138,7 @@ def test_a_process_that_fails_at_once_ends_the_run_with_its_reason(
 def test_the_reason_of_an_end_is_not_quoted_from_an_earlier_run(
     beside: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", _DEADLINE_S)
+    monkeypatch.setattr(fleet_module, "_MIN_LIFE_S", PATIENCE_S)
     (beside / "actor-0.log").write_text("10:00 INFO actor: all was well\n")
     put(beside, "actor", "import sys; sys.exit(1)")
     fleet.start("actor", "actor-0", [])
