@@ -65,8 +65,9 @@ ENV PATH=/opt/mrcdrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTEC
 WORKDIR /
 USER mrcdrl
 ENTRYPOINT ["mrcdrl"]
-# Unhealthy after 30 s without work; a main loop that hangs for 120 s is killed and restarted.
-HEALTHCHECK --interval=5s --timeout=5s --start-period=120s --retries=2 \
+# Unhealthy after 30 s without work; a main loop that hangs for 120 s is killed and restarted. The start
+# period is for replay, which may need it to read a long log; the first check that passes ends it.
+HEALTHCHECK --interval=5s --timeout=30s --start-period=600s --retries=2 \
     CMD ["python", "-m", "mrcdrl.common.runtime.heartbeat", "--max-age", "30", "--kill-after", "120"]
 
 FROM service AS small

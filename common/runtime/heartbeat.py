@@ -1,8 +1,9 @@
 """The heartbeat: a file that says when a process last worked, for a container's health check.
 
 Invariants: the main loop writes it, in one move, which shows that the loop still runs; all times
-are of one machine's monotonic clock; without MRCDRL_HEARTBEAT nothing is written. Only the standard
-library is imported: a check every few seconds must cost next to nothing.
+are of one machine's monotonic clock; without MRCDRL_HEARTBEAT nothing is written. A loop whose next
+pass may take long for a good reason says so before it. Only the standard library is imported: a
+check every few seconds must cost next to nothing.
 """
 
 import argparse
@@ -28,20 +29,30 @@ class Heartbeat:
 
     @classmethod
     def from_environment(cls) -> "Heartbeat":
+        """The heartbeat that the environment asks for; forgets that of an earlier process."""
         name = os.environ.get(FILE_VARIABLE)
-        return cls(Path(name) if name else None)
+        path = Path(name) if name else None
+        if path is not None:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+        return cls(path)
 
     def worked(self, at_s: float | None = None) -> None:
         """Note that work was done, or that there is none to do, at `at_s` (now by default)."""
         self._worked_s = max(self._worked_s, time.monotonic() if at_s is None else at_s)
 
-    def beat(self) -> None:
-        """Write that the main loop runs, and when it last worked."""
+    def beat(self, patience_s: float = 0.0) -> None:
+        """Write that the main loop runs, and when it last worked.
+
+        patience_s: how long its next pass may take; a check allows at least that much silence.
+        """
         if self._path is None:
             return
         new = self._path.with_suffix(".new")
         with contextlib.suppress(OSError):  # a failure shows as silence
-            new.write_text(f"{os.getpid()} {time.monotonic()} {self._worked_s}", "ascii")
+            new.write_text(
+                f"{os.getpid()} {time.monotonic()} {self._worked_s} {patience_s}", "ascii"
+            )
             new.replace(self._path)
 
 
@@ -52,19 +63,25 @@ class Pulse:
     pid: int
     beat_s: float  # when it was written
     worked_s: float
+    patience_s: float = 0.0
 
     @classmethod
     def read(cls, path: Path) -> "Pulse":
         """Read the file; raises OSError or ValueError if there is no whole one."""
-        pid, beat_s, worked_s = path.read_text("ascii").split()
-        return cls(int(pid), float(beat_s), float(worked_s))
+        pid, beat_s, worked_s, patience_s = path.read_text("ascii").split()
+        return cls(int(pid), float(beat_s), float(worked_s), float(patience_s))
+
+    def silent_longer_than(self, age_s: float, now_s: float) -> bool:
+        """Whether the main loop has been silent for that long, and for longer than it asked for."""
+        return now_s - self.beat_s > max(age_s, self.patience_s)
 
     def problem(self, now_s: float, max_age_s: float) -> str | None:
         """The problem, in words; None if the process does its work."""
-        if now_s - self.beat_s > max_age_s:
+        if self.silent_longer_than(max_age_s, now_s):
             return f"hung: no heartbeat from its main loop for {now_s - self.beat_s:.0f} s"
-        if now_s - self.worked_s > max_age_s:
-            return f"idle: no work and no message for {now_s - self.worked_s:.0f} s"
+        idle_s = (self.beat_s if self.patience_s else now_s) - self.worked_s
+        if idle_s > max_age_s:
+            return f"idle: no work and no message for {idle_s:.0f} s"
         return None
 
 
@@ -84,7 +101,8 @@ def main(argv: Sequence[str]) -> int:
         return 1
     problem = pulse.problem(now_s, arguments.max_age)
     sys.stdout.write(f"{problem or 'works'}\n")
-    if arguments.kill_after is not None and now_s - pulse.beat_s > arguments.kill_after:
+    limit_s = arguments.kill_after
+    if limit_s is not None and pulse.silent_longer_than(limit_s, now_s):
         os.kill(pulse.pid, signal.SIGKILL)  # its supervisor restarts it
     return 1 if problem else 0
 

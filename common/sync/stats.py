@@ -12,17 +12,27 @@ from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.versions import versions
 from mrcdrl.common.transport import Publisher
 
+_WARM_UP_S = 600.0  # to compile what the first work needs, where ten others want the cores, too
+
 
 class StatsReporter:
     """Publishes a service's metrics and writes its heartbeat, from the service's main loop."""
 
-    def __init__(self, publisher: Publisher, role: str, worker: str) -> None:
+    def __init__(
+        self, publisher: Publisher, role: str, worker: str, *, warms_up: bool = False
+    ) -> None:
+        """warms_up: the first work may take minutes; no hang is told before `warmed_up`."""
         self._publisher = publisher
         self._role = role
         self._worker = worker
         self._text = {"incarnation": str(time.time_ns()), **versions()}
         self._heartbeat = Heartbeat.from_environment()
+        self._patience_s = _WARM_UP_S if warms_up else 0.0
         self._due_s = 0.0
+
+    def warmed_up(self) -> None:
+        """Note that the first work is done: from now on a long silence is a hang."""
+        self._patience_s = 0.0
 
     def worked(self, at_s: float | None = None) -> None:
         """Note that work was done, or that there is none to do, at `at_s` (now by default)."""
@@ -42,4 +52,4 @@ class StatsReporter:
             self._publisher.put(encode(stats))
         except TransportError as error:
             logging.getLogger(self._role).warning("statistics not published: %s", error)
-        self._heartbeat.beat()
+        self._heartbeat.beat(self._patience_s)

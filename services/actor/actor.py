@@ -50,7 +50,7 @@ class Actor:
         self._reader = WeightsReader(session, keys, self._adopt)
         self._episodes = session.publisher(keys.episodes(worker))
         self._reporter = StatsReporter(
-            session.publisher(keys.stats("actor", worker)), "actor", worker
+            session.publisher(keys.stats("actor", worker)), "actor", worker, warms_up=True
         )
         self._policy = make_policy(config, resolve_device(config.actor.device, "actor.device"))
         self._collector = make_collector(config, worker, self._policy)
@@ -76,6 +76,7 @@ class Actor:
         self, chunks: Sequence[Chunk], episodes: Sequence[EpisodeSummary], stop: StopSignal
     ) -> None:
         """Spool the chunks, publish the episode summaries, report."""
+        self._reporter.warmed_up()
         began_s = time.monotonic()
         self._sender.put_all(chunks, stop, self._report_waiting)
         self._waited_s += time.monotonic() - began_s

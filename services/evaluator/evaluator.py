@@ -50,12 +50,13 @@ class Evaluator:
         confirmer = WeightsEvaluator(confirming(config), worker)
         self._best = BestWeights(
             joining.run_dir / BEST_WEIGHTS,
-            lambda weights: confirmer.evaluate(weights, self._keep_going),
+            lambda weights: confirmer.evaluate(weights, self._before_frame),
         )
         self._publisher = session.publisher(keys.evaluation(worker))
         self._reporter = StatsReporter(
-            session.publisher(keys.stats("evaluator", worker)), "evaluator", worker
+            session.publisher(keys.stats("evaluator", worker)), "evaluator", worker, warms_up=True
         )
+        self._frames = 0  # each of many arenas
         self._evaluations = 0
         self._version = -1
         self._busy = False
@@ -73,7 +74,7 @@ class Evaluator:
     def _evaluate(self, weights: Weights) -> None:
         """Evaluate one version, publish the result, keep the weights if they are the best."""
         self._version, self._busy = weights.version, True
-        result = self._evaluator.evaluate(weights, self._keep_going)
+        result = self._evaluator.evaluate(weights, self._before_frame)
         if result is not None:
             self._evaluations += 1
             self._publisher.put(encode(result))
@@ -91,6 +92,13 @@ class Evaluator:
             else:
                 newest = self._reader.latest(_POLL_S)
         return newest
+
+    def _before_frame(self) -> bool:
+        """Report, as each frame is work done; whether to play it."""
+        if self._frames:
+            self._reporter.warmed_up()
+        self._frames += 1
+        return self._keep_going()
 
     def _keep_going(self) -> bool:
         self._report()

@@ -36,6 +36,9 @@ def main(argv: Sequence[str]) -> int:
         session = owned.enter_context(Session(joining.transport))
         bulk = owned.enter_context(Session(joining.transport))
         config = fetch_config(session, joining, stop)
+        reporter = StatsReporter(
+            session.publisher(keys.stats("learner", worker)), "learner", worker, warms_up=True
+        )
         settings, lockstep = config.learner, Lockstep.from_config(config)
         torch.set_num_threads(1)  # threads share batches, not operations
         learner = make_learner(config)
@@ -58,9 +61,6 @@ def main(argv: Sequence[str]) -> int:
         prefetcher = Prefetcher(reader, collate, settings.prefetch_batches, stop)
         owned.callback(prefetcher.close)
         owned.callback(stop.set)  # called first: the threads above end by it
-        reporter = StatsReporter(
-            session.publisher(keys.stats("learner", worker)), "learner", worker
-        )
         session.announce(keys.live("learner", worker))
         _LOG.info("%s", learner)
         run(config, learner, prefetcher, priorities, publisher, reporter, stop)

@@ -43,6 +43,7 @@ def run(
             reporter.worked(None if batches else prefetcher.heard_s)
             if batches:
                 updates = timer.timed("step", partial(learner.steps, batches))
+                reporter.warmed_up()
                 timer.last = (batches[-1], updates[-1])
                 if priorities is not None:
                     for batch, update in zip(batches, updates, strict=True):

@@ -125,11 +125,13 @@ def test_it_may_do_no_more_than_in_compose(name: str) -> None:
 @workloads
 def test_health_is_judged_as_in_the_image(name: str) -> None:
     healthcheck = re.search(
-        r"HEALTHCHECK .*\\\n\s+CMD (\[.*\])", (ROOT / "Dockerfile").read_text("utf-8")
+        r"HEALTHCHECK .*--timeout=(\d+)s .*\\\n\s+CMD (\[.*\])",
+        (ROOT / "Dockerfile").read_text("utf-8"),
     )
     assert healthcheck is not None
     service = container(name)
-    assert service["readinessProbe"]["exec"]["command"] == yaml.safe_load(healthcheck[1])
+    assert service["readinessProbe"]["exec"]["command"] == yaml.safe_load(healthcheck[2])
+    assert service["readinessProbe"]["timeoutSeconds"] == int(healthcheck[1])
     assert PODS[name]["spec"]["shareProcessNamespace"] is True, "a process 1 is not to be killed"
     for probe in ("livenessProbe", "startupProbe"):
         assert service[probe]["exec"]["command"][:3] == ["python", "-m", HEARTBEAT]

@@ -6,6 +6,7 @@ Who has no certificate, or plays another's role, is refused, and the router's lo
 import json
 import socket
 import ssl
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,10 +17,18 @@ import pytest
 
 from mrcdrl.common.config import TransportConfig
 from mrcdrl.common.errors import DeadlineError, EndpointError
+from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Pulse
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.certificates import make
-from tests.system.system_processes import SMALL, Command, eventually, run_name, serves
+from tests.system.system_processes import (
+    PATIENCE_S,
+    SMALL,
+    Command,
+    eventually,
+    run_name,
+    serves,
+)
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
@@ -41,10 +50,10 @@ class Secured:
     endpoint: str
     certificates: Path
 
-    def join(self, role: str, **other: str) -> Session:
+    def join(self, role: str, wait_s: float = PATIENCE_S, **other: str) -> Session:
         given = files(self.certificates / role) | other
-        config = TransportConfig(connect=(self.endpoint,), timeout_s=5.0, **given)
-        return Session(config, open_timeout_s=0.0)
+        config = TransportConfig(connect=(self.endpoint,), timeout_s=PATIENCE_S, **given)
+        return Session(config, open_timeout_s=wait_s)
 
     def says(self, text: str) -> None:
         eventually(lambda: text in self.process.err, f"the router's log says {text!r}")
@@ -65,7 +74,7 @@ def test_without_a_certificate_nobody_is_let_in(secured: Secured) -> None:
     host, port = secured.endpoint.removeprefix("tls/").split(":")
     context = ssl.create_default_context(cafile=secured.certificates / "actor" / "ca.pem")
     with (
-        socket.create_connection((host, int(port)), timeout=30) as plain,
+        socket.create_connection((host, int(port)), timeout=PATIENCE_S) as plain,
         context.wrap_socket(plain, server_hostname=host) as wrapped,
         pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"),
     ):
@@ -77,14 +86,14 @@ def test_a_certificate_of_another_authority_is_refused(secured: Secured, tmp_pat
     make(tmp_path, ["learner"], ["localhost"], timedelta(days=1))
     foreign = files(tmp_path / "learner") | {"ca": files(secured.certificates / "learner")["ca"]}
     with pytest.raises(EndpointError, match="does not accept this certificate"):
-        secured.join("learner", **foreign)
+        secured.join("learner", 0.0, **foreign)
     secured.says("refused a connection: invalid peer certificate")
 
 
 def test_a_router_of_another_authority_is_not_trusted(secured: Secured, tmp_path: Path) -> None:
     make(tmp_path, ["learner"], ["localhost"], timedelta(days=1))
     with pytest.raises(EndpointError, match="nobody answers"):
-        secured.join("learner", ca=files(tmp_path / "learner")["ca"])
+        secured.join("learner", 0.0, ca=files(tmp_path / "learner")["ca"])
 
 
 def test_an_actor_publishes_no_weights(secured: Secured) -> None:
@@ -147,7 +156,8 @@ def test_a_run_trains(secured: Secured, tmp_path: Path) -> None:
 
     def command(role: str, *more: str) -> Command:
         folder = secured.certificates / role
-        return Command([role, *joining, *more], tmp_path, **variables(folder))
+        beats = {FILE_VARIABLE: str(tmp_path / f"{role}.heartbeat")}
+        return Command([role, *joining, *more], tmp_path, **variables(folder), **beats)
 
     with ExitStack() as started:
         smoke = ("--config", "smoke", "--run.learner_steps", "0", *SMALL)
@@ -171,6 +181,10 @@ def test_a_run_trains(secured: Secured, tmp_path: Path) -> None:
             )
 
         eventually(trained, "the run learns, acts by its weights and judges them")
+        for role in ("replay", "learner", "actor", "evaluator"):
+            beats = tmp_path / f"{role}.heartbeat"
+            eventually(lambda: Pulse.read(beats).patience_s == 0, f"{role} has warmed up")  # noqa: B023
+            assert Pulse.read(beats).problem(time.monotonic(), PATIENCE_S) is None
     assert f"mrcdrl/{name}" not in secured.process.err, "the router refused something of the run"
 
 

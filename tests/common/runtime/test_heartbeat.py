@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Heartbeat, Pulse, main
+from tests.patience import PATIENCE_S
 
 
 @pytest.mark.parametrize(
@@ -24,6 +25,34 @@ from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Heartbeat, Pulse, mai
 def test_problem(beat_s: float, worked_s: float, problem: str | None) -> None:
     found = Pulse(1, beat_s, worked_s).problem(100, 30)
     assert found == problem or (problem and found and found.startswith(problem))
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "problem"), [(8, None), (31, None), (600, None), (601, "hung")]
+)
+def test_a_loop_that_said_its_next_pass_takes_long_is_given_the_time(
+    silent_s: float, problem: str | None
+) -> None:
+    """As at a first frame, with functions to compile, where ten others want the cores."""
+    pulse = Pulse(1, 100, 100, patience_s=600)
+    found = pulse.problem(100 + silent_s, 30)
+    assert found == problem or (problem and found and found.startswith(problem))
+    assert Pulse(1, 100, 60, patience_s=600).problem(101, 30) == (
+        "idle: no work and no message for 40 s"
+    )
+    assert pulse.silent_longer_than(120, 100 + silent_s) == (problem is not None)
+
+
+def test_what_an_earlier_process_wrote_is_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "heartbeat"
+    monkeypatch.setenv(FILE_VARIABLE, str(path))
+    Heartbeat(path).beat()
+    heartbeat = Heartbeat.from_environment()
+    assert not path.exists()
+    heartbeat.beat(600.0)
+    assert Pulse.read(path).patience_s == 600.0
 
 
 def test_a_beat_is_read_back(tmp_path: Path) -> None:
@@ -66,21 +95,27 @@ def test_no_heartbeat_is_unhealthy(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("silent_s", "code", "alive"), [(0, 0, True), (60, 1, True), (200, 1, False)]
+    ("silent_s", "patience_s", "code", "alive"),
+    [(0, 0, 0, True), (60, 0, 1, True), (200, 0, 1, False), (200, 600, 0, True)],
 )
 def test_a_process_that_hangs_is_killed(
-    silent_s: float, code: int, alive: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    silent_s: float,
+    patience_s: float,
+    code: int,
+    alive: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = tmp_path / "heartbeat"
     monkeypatch.setenv(FILE_VARIABLE, str(path))
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         then_s = time.monotonic() - silent_s
-        path.write_text(f"{process.pid} {then_s} {then_s}")
+        path.write_text(f"{process.pid} {then_s} {then_s} {patience_s}")
         assert main(["--max-age", "30", "--kill-after", "120"]) == code
         if alive:
             assert process.poll() is None
         else:
-            assert process.wait(10) == -9
+            assert process.wait(PATIENCE_S) == -9
         process.kill()
 
 

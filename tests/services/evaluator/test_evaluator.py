@@ -13,10 +13,13 @@ from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights
 from mrcdrl.common.messages.wire import decode_published, encode
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Pulse
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.joining import Joining
+from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.services.evaluator.evaluator import Evaluator
+from tests.patience import PATIENCE_S
 
 SMALL = {
     "arena.view_px": "32",
@@ -41,9 +44,37 @@ def weights(epoch: int, version: int, view_px: int = 32) -> bytes:
 
 
 def eventually(reached: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + PATIENCE_S
     while not reached():
         assert time.monotonic() < deadline
+
+
+def test_each_frame_is_work_and_only_the_first_may_take_minutes(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "heartbeat"
+    monkeypatch.setenv(FILE_VARIABLE, str(path))
+    monkeypatch.setattr(StatsReporter, "publish_if_due", StatsReporter.publish)
+    pulses: list[Pulse] = []
+
+    def play(*_: object, keep_going: Callable[[int], bool]) -> None:
+        for frame in range(3):
+            keep_going(frame)
+            pulses.append(Pulse.read(path))
+        stop.set()
+
+    monkeypatch.setattr("mrcdrl.services.evaluator.evaluator.play", play)
+    joining, stop = Joining("judged", "e", tmp_path, TransportConfig(), {}), StopSignal()
+    server = session.server(joining.keys.weights)
+    thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
+    thread.start()
+    while thread.is_alive():
+        request = server.take(0.1)
+        if request is not None:
+            request.reply(weights(1, 1))
+    first, second, third = pulses
+    assert (first.patience_s, second.patience_s, third.patience_s) == (600, 0, 0)
+    assert first.worked_s < second.worked_s < third.worked_s
 
 
 def test_refused_weights_are_told_and_do_not_block_good_ones(
