@@ -4,6 +4,7 @@ MrcdrlError
 ├── ConfigError         a setting is unknown, impossible or contradicts another
 ├── RunDirectoryError   a run directory exists, is missing, or cannot be written
 ├── CheckpointError     weights or a checkpoint are unreadable, damaged or of another network
+├── NameTakenError      another process of the run has this worker's name, or its task
 ├── DivergedError       learning produced numbers that are not finite, and would again
 ├── WireError           bytes from a peer break the wire's schema (counted and dropped)
 └── TransportError      the network failed to do what was asked
@@ -32,6 +33,10 @@ class RunDirectoryError(MrcdrlError):
 
 class CheckpointError(MrcdrlError):
     """Weights or a checkpoint are unreadable, damaged or of another network."""
+
+
+class NameTakenError(MrcdrlError):
+    """Another process of the run has this worker's name, or the task that only one may have."""
 
 
 class DivergedError(MrcdrlError):

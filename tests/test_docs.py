@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -53,6 +54,7 @@ from mrcdrl.services.replay.inspect.export import arrays
 from mrcdrl.services.replay.inspect.summary import summarize as summarize_log
 from mrcdrl.services.tools.failure_summary import QUESTIONS, Share, as_json, summarize
 from mrcdrl.services.tools.failures import Contact, Failure, LateRobot
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -172,6 +174,7 @@ def wire_type(hint: Any) -> str:
 def key_expressions() -> Iterator[str]:
     keys = Keys("RUN")
     values = {"shard": "SHARD", "worker": "WORKER", "actor": "WORKER", "role": "ROLE"}
+    values |= {"name": "NAME", "incarnation": "NS"}
     for name, member in vars(Keys).items():
         if isinstance(member, property):
             yield getattr(keys, name)
@@ -182,7 +185,7 @@ def key_expressions() -> Iterator[str]:
 
 @pytest.mark.parametrize("key", sorted({k for k in key_expressions() if "*" not in k}))
 def test_key_is_documented(key: str) -> None:
-    shown = re.sub(r"\b(RUN|SHARD|WORKER|ROLE)\b", lambda m: f"<{m[0].lower()}>", key)
+    shown = re.sub(r"\b(RUN|SHARD|WORKER|ROLE|NAME|NS)\b", lambda m: f"<{m[0].lower()}>", key)
     if shown.endswith("/*"):
         pytest.skip("a wildcard")
     assert shown in names(part(page("wire.md"), "## Keys"))
@@ -239,15 +242,14 @@ def test_example_subscriber_runs(precision: torch.dtype, tmp_path: Path) -> None
         try:
             weights_out = session.publisher(keys.weights)
             tests_out = session.publisher(keys.evaluation("e"))
-            for _ in range(150):  # until the example has subscribed
-                weights_out.put(encode(weights))
+            deadline = time.monotonic() + PATIENCE_S
+            while not both.wait(0.1) and time.monotonic() < deadline:
+                weights_out.put(encode(weights))  # until the example has subscribed
                 tests_out.put(encode(test))
-                if both.wait(0.1):
-                    break
         finally:
             process.terminate()
-            process.wait(10)
-            reader.join(10)
+            process.wait(PATIENCE_S)
+            reader.join(PATIENCE_S)
             if process.stdout is not None:
                 process.stdout.close()
     assert both.is_set(), "".join(lines)

@@ -4,6 +4,7 @@ Invariants: a file gets its name only when its bytes are on the disk; a write th
 killed leaves nothing under the final name.
 """
 
+import fcntl
 import hashlib
 import os
 from pathlib import Path
@@ -51,6 +52,20 @@ def atomic_write(path: Path, content: bytes, mode: int = 0o644) -> None:
         temporary.unlink(missing_ok=True)
         raise
     sync_directory(path.parent)
+
+
+def lock_directory(path: Path) -> int:
+    """Lock a directory against other processes; return the descriptor that holds the lock.
+
+    Raises BlockingIOError if another one has it, another OSError where it cannot be locked.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
 
 
 def sha256(content: bytes) -> str:

@@ -10,6 +10,7 @@ mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
 mrcdrl/<run>/stats/<role>/<worker>     publication: Stats
 mrcdrl/<run>/live/<role>/<worker>      liveliness token
+mrcdrl/<run>/claim/<role>/<name>/<ns>  liveliness token
 """
 
 from dataclasses import dataclass
@@ -58,6 +59,9 @@ class Keys:
 
     def live(self, role: str, worker: str) -> str:
         return f"mrcdrl/{self.run}/live/{role}/{worker}"
+
+    def claim(self, role: str, name: str, incarnation: str) -> str:
+        return f"mrcdrl/{self.run}/claim/{role}/{name}/{incarnation}"
 
     @property
     def every_evaluation(self) -> str:

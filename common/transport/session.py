@@ -22,7 +22,13 @@ from typing import Any
 import zenoh
 
 from mrcdrl.common.config import TransportConfig
-from mrcdrl.common.errors import ConfigError, EndpointError, UnreachableError
+from mrcdrl.common.errors import (
+    ConfigError,
+    DeadlineError,
+    EndpointError,
+    TransportError,
+    UnreachableError,
+)
 from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.transport.publications import (
     LatestSubscriber,
@@ -214,9 +220,23 @@ class Session(Closing):
         )
         return client
 
-    def announce(self, key: str) -> None:
-        """Hold a liveliness token on `key` while the session is open."""
-        self._declare(lambda on: on.liveliness().declare_token(key))
+    def announce(self, key: str) -> Callable[[], None]:
+        """Hold a liveliness token on `key` while the session is open; return what withdraws it."""
+        declaration = self._declare(lambda on: on.liveliness().declare_token(key))
+        return lambda: self._withdraw(declaration)
+
+    def tokens(self, key: str) -> frozenset[str]:
+        """The keys of the liveliness tokens that are held on `key`; raises TransportError."""
+        try:
+            with self._lock:
+                asked = self._session.liveliness().get(key, timeout=self._config.timeout_s)
+            replies = [reply.ok for reply in asked]
+        except zenoh.ZError as error:
+            raise TransportError(f"cannot ask who is there: {_first_line(error)}") from error
+        held = frozenset(str(sample.key_expr) for sample in replies if sample is not None)
+        if None in replies:
+            raise DeadlineError("the router does not answer who is there")
+        return held
 
     def presence(self, key: str) -> "Presence":
         """The liveliness tokens on `key`, including those held already."""
@@ -227,12 +247,18 @@ class Session(Closing):
 
     def _declare(
         self, make: Callable[[zenoh.Session], Any], use: Callable[[Any], None] = lambda _: None
-    ) -> None:
+    ) -> _Declaration:
         """make: declares it on a Zenoh session. use: takes the result, each time."""
         declaration = _Declaration(make, use)
         with self._lock:
             declaration.on(self._session)
             self._declarations.append(declaration)
+        return declaration
+
+    def _withdraw(self, declaration: _Declaration) -> None:
+        with self._lock, contextlib.suppress(zenoh.ZError):
+            self._declarations.remove(declaration)
+            declaration.declared.undeclare()
 
     def _open(self, settings: zenoh.Config, deadline: float) -> zenoh.Session:
         while True:

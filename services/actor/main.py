@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.sync.claim import claim_name
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.transport import Session
@@ -20,6 +21,7 @@ def main(argv: Sequence[str]) -> int:
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session, Session(joining.transport) as bulk:
         config = fetch_config(session, joining, stop)
+        claim_name(session, joining.keys, "actor", joining.worker, stop)
         torch.set_num_threads(config.actor.threads)
         session.announce(joining.keys.live("actor", joining.worker))
         writer = ReplayWriter.from_config(bulk, joining.keys, config, joining.worker, stop)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal, yield_cores
+from mrcdrl.common.sync.claim import claim_name
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.evaluator import Evaluator
@@ -19,6 +20,7 @@ def main(argv: Sequence[str]) -> int:
     stop = StopSignal().listen(STOP_DEADLINE_S)
     with Session(joining.transport) as session:
         config = fetch_config(session, joining, stop)
+        claim_name(session, joining.keys, "evaluator", joining.worker, stop)
         torch.set_num_threads(config.evaluator.threads)
         evaluator = Evaluator(config, joining, session, stop, lambda: yield_cores(_NICE))
         session.announce(joining.keys.live("evaluator", joining.worker))

@@ -10,6 +10,7 @@ import torch
 from mrcdrl.common.config import Config
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.sync.claim import claim_learner
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.sync.stats import StatsReporter
@@ -36,6 +37,7 @@ def main(argv: Sequence[str]) -> int:
         session = owned.enter_context(Session(joining.transport))
         bulk = owned.enter_context(Session(joining.transport))
         config = fetch_config(session, joining, stop)
+        claim_learner(session, keys, stop)
         reporter = StatsReporter(
             session.publisher(keys.stats("learner", worker)), "learner", worker, warms_up=True
         )

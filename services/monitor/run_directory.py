@@ -7,7 +7,6 @@
 Invariants: a directory that exists never becomes a new run; two processes never hold one.
 """
 
-import fcntl
 import os
 import shutil
 import time
@@ -18,7 +17,7 @@ from typing import Self
 from mrcdrl.common.config import Config, load_config, refuse_changes, to_toml
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.runtime.closing import Closing
-from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, reason
+from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, lock_directory, reason
 from mrcdrl.common.sync.joining import ENDPOINT_FILE
 
 Check = Callable[[Config, Config], None]  # of what a run was made with, and is resumed with
@@ -41,11 +40,9 @@ class RunDirectory(Closing):
         self.path = path
         self.config = config
         self.resumed = resumed
-        self._lock = os.open(path, os.O_RDONLY)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._lock)
+            self._lock = lock_directory(path)
+        except BlockingIOError as error:
             raise RunDirectoryError(f"{path} is in use by another process") from error
 
     @classmethod

@@ -24,6 +24,7 @@ SHARES = of_kind("share")
 STALENESS = ("versions", "s")
 HISTORY_PERIOD = 10  # episodes between two points of the success curve
 LOG_LINES = 100
+MAX_FORMER = 16  # starts of a service before the present one that are remembered
 MAX_SERVICES = 4096  # a peer may claim any number of names
 
 
@@ -40,6 +41,10 @@ class Service:
     rates: dict[str, Rate] = field(default_factory=dict)
     shares: dict[str, Share] = field(default_factory=dict)
     staleness: dict[str, SpreadWindow] = field(default_factory=dict)  # of its weights, by unit
+    former: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_FORMER))
+    """Incarnations before the present one."""
+    namesakes: int = 0
+    """Reports of those, which came after the present one had begun."""
 
     def read(self, schema: type[M]) -> M:
         """Its metrics as last reported, shares averaged over the window."""
@@ -97,10 +102,20 @@ class RunState:
     # -- observations ------------------------------------------------------------------
 
     def observe_stats(self, stats: Stats, now: float) -> None:
-        """Take a service's metrics; a fallen counter or a new `incarnation` means a restart."""
+        """Take a service's metrics; a fallen counter or a new `incarnation` means a restart.
+
+        After a restart, what still comes from an earlier incarnation is another process of that
+        name: it is left out, which is said once.
+        """
         service = self._service(stats.role, stats.id)
         before = service.text.get("incarnation")
-        restarted = before is not None and before != stats.text.get("incarnation", before)
+        present = stats.text.get("incarnation", before)
+        if present in service.former:
+            self._observe_namesake(service)
+            return
+        restarted = before is not None and before != present
+        if before is not None and restarted:
+            service.former.append(before)
         service.alive, service.heard_s = True, now
         service.metrics, service.text = dict(stats.metrics), dict(stats.text)
         for name in COUNTERS.get(stats.role, ()):
@@ -116,6 +131,14 @@ class RunState:
         stale = self.staleness(service) if stats.role == "actor" else None
         for unit, value in zip(STALENESS, stale or (), strict=False):
             service.staleness.setdefault(unit, SpreadWindow()).observe(value, now)
+
+    def _observe_namesake(self, service: Service) -> None:
+        service.namesakes += 1
+        if service.namesakes == 2:  # one may have been on its way when its process ended
+            self.observe_log(
+                f"two processes of the role {service.role} are named {service.id}: only the newer "
+                "one is counted; give each its own --id"
+            )
 
     def observe_episode(self, episode: EpisodeSummary) -> None:
         self.episodes += 1

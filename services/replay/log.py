@@ -22,7 +22,7 @@ from zlib_ng import zlib_ng  # ten times as fast as zlib
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.framing import Part
-from mrcdrl.common.runtime.files import reason, sync_directory
+from mrcdrl.common.runtime.files import lock_directory, reason, sync_directory
 
 _LOG = logging.getLogger("replay")
 _HEADER = struct.Struct("<II")
@@ -74,6 +74,7 @@ class SegmentLog:
         self._segment_bytes = segment_bytes
         self._fsync = fsync
         self._descriptor: int | None = None
+        self._lock: int | None = None
         self._size = 0
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -94,6 +95,17 @@ class SegmentLog:
     def first_key(self) -> int:
         """Key of the oldest transition in the log; 0 if it is empty."""
         return self._segments[0].first_key if self._segments else 0
+
+    def lock(self) -> None:
+        """Keep other processes out until `close`; raises RunDirectoryError if one is there."""
+        try:
+            self._lock = lock_directory(self._directory)
+        except BlockingIOError as error:
+            raise RunDirectoryError(
+                f"{self._directory} is in use by another process: a shard of replay has one"
+            ) from error
+        except OSError as error:
+            _LOG.warning("%s cannot be locked: %s", self._directory, reason(error))
 
     def recover(self, next_key: Callable[[], int]) -> Iterator[bytes]:
         """Yield all whole payloads, oldest first; exhaust it before the first append.
@@ -144,6 +156,9 @@ class SegmentLog:
     def close(self) -> None:
         """Sync the last segment to disk; the system writes out earlier ones in its own time."""
         self._end_segment(fsync=True)
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def _end_segment(self, *, fsync: bool) -> None:
         if self._descriptor is not None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from mrcdrl.common.config import to_toml
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.sync.claim import claim_shard
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session
 from mrcdrl.services.replay.leases import LeaseTable, answer_leases
@@ -26,7 +27,10 @@ def main(argv: Sequence[str]) -> int:
     stop = StopSignal().listen(STOP_DEADLINE_S)
     table, limiter = Table.from_config(config), RateLimiter.from_config(config)
     log = open_log(config, serving.log_directory)
+    if log is not None:
+        log.lock()
     with Session(serving.transport) as session:
+        claim_shard(session, keys, shard, stop)
         config_requests = session.server(keys.config)
         lease_requests = session.server(keys.leases) if shard == 0 else None
         inserts, samples = session.server(keys.insert(shard)), session.server(keys.sample(shard))

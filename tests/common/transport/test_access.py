@@ -19,8 +19,8 @@ from mrcdrl.common.errors import DeadlineError, EndpointError
 from mrcdrl.common.transport import Server, Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.certificates import make
+from tests.patience import PATIENCE_S
 
-_PATIENCE_S = 30.0
 _STATISTICS_S = 0.04  # apart: twice what the router's file asks for
 RUN = Keys("access")
 ROLES = ("replay", "learner", "actor", "evaluator", "status", "robot")
@@ -39,6 +39,8 @@ PUBLISHED = {
     **{f"stats of {role}": RUN.stats(role, "w") for role in ROLES},
 }
 LIVE = {f"live {role}": RUN.live(role, "w") for role in ROLES}
+CLAIMS = {role: RUN.claim(role, "w", "1") for role in ROLES}
+CLAIMERS = {"replay", "learner", "actor", "evaluator"}
 
 
 @dataclass(frozen=True)
@@ -126,16 +128,16 @@ class Pair:
     def __post_init__(self) -> None:
         if "config" in MAY[self.role].serve:
             self._server = self.own.server(RUN.config)
-            self._client = self.other.client(RUN.config, self.role, _PATIENCE_S)
+            self._client = self.other.client(RUN.config, self.role, PATIENCE_S)
         else:
             self._server = self.other.server(RUN.config)
-            self._client = self.own.client(RUN.config, "the other side", _PATIENCE_S)
+            self._client = self.own.client(RUN.config, "the other side", PATIENCE_S)
 
     def settle(self) -> None:
         """Return when all that was sent on the connection before, either way, has been judged."""
         for _ in range(1000):
             pending = self._client.ask(b"")
-            request = self._server.take(_PATIENCE_S if self._settled else 0.1)
+            request = self._server.take(PATIENCE_S if self._settled else 0.1)
             if request is not None:
                 request.reply(b"")
                 assert pending.result() == b""
@@ -177,7 +179,7 @@ def published(sender: Session, receiver: Session, settle: Callable[[], None], ke
 
 def answered(asker: Session, server: Server, settle: Callable[[], None], key: str) -> bool:
     settle()
-    pending = asker.client(key, "the other", _PATIENCE_S).ask(b"question")
+    pending = asker.client(key, "the other", PATIENCE_S).ask(b"question")
     settle()
     request = server.take(0.0)
     if request is None:
@@ -237,6 +239,21 @@ def test_seeing_who_is_there(pair: Pair) -> None:
     pair.settle()
     assert {n for n, presence in seen.items() if presence.alive()} == set(MAY[pair.role].watch)
     assert everyone.alive() <= {LIVE[name] for name in MAY[pair.role].watch}
+
+
+@every_role
+def test_claiming_names_and_seeing_who_has_them(pair: Pair) -> None:
+    for key in CLAIMS.values():
+        pair.own.announce(key)
+    pair.settle()
+    held = pair.other.tokens(RUN.claim("*", "w", "*"))
+    assert held == ({CLAIMS[pair.role]} if pair.role in CLAIMERS else set())
+    assert pair.own.tokens(RUN.claim("*", "w", "*")) >= held
+    pair.other.announce(RUN.claim("actor", "v", "2"))
+    pair.settle()
+    pair.settle()
+    found = {RUN.claim("actor", "v", "2")} if pair.role in CLAIMERS else set()
+    assert pair.own.tokens(RUN.claim("*", "v", "*")) == found
 
 
 @pytest.mark.parametrize("pair", ["status"], indirect=True)

@@ -64,6 +64,17 @@ def test_an_actor_that_restarted_counts_on_from_what_it_had() -> None:
     assert state.per_second("env_steps", 3) == pytest.approx(125 / 3)
 
 
+def test_of_two_processes_with_one_name_the_newer_is_counted_and_it_is_said_once() -> None:
+    state = RunState(Config())
+    for second in range(100):
+        for incarnation, steps in (("1", 1000 + second), ("2", 10 * second)):
+            text = {"incarnation": incarnation}
+            state.observe_stats(Stats("actor", "a", {"robot_steps": steps}, text), second)
+    assert state.robot_steps == 1000 + 990
+    (said,) = state.log
+    assert said.startswith("two processes of the role actor are named a: only the newer one")
+
+
 def test_a_new_incarnation_is_a_restart_even_if_the_counter_rose() -> None:
     state = RunState(config())
     state.observe_stats(Stats("actor", "0", {"env_steps": 10}, {"incarnation": "1"}), 0)

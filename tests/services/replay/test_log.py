@@ -43,6 +43,15 @@ def segments(directory: Path) -> list[Path]:
 PAYLOADS = [bytes([n]) * 40 for n in range(12)]
 
 
+def test_a_directory_is_one_log_s(tmp_path: Path) -> None:
+    log = open_log(tmp_path)
+    log.lock()
+    with pytest.raises(RunDirectoryError, match="in use by another process"):
+        open_log(tmp_path).lock()
+    log.close()
+    open_log(tmp_path).lock()
+
+
 def test_what_was_appended_comes_back_in_order(tmp_path: Path) -> None:
     write(tmp_path, PAYLOADS)
     assert len(segments(tmp_path)) > 1
