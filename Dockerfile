@@ -36,8 +36,15 @@ FROM small-installed AS certs-installed
 RUN pip --python /opt/mrcdrl/bin/python install cryptography
 
 FROM installer AS learning-installed
-RUN --mount=type=bind,from=wheels,target=/wheels pip --python /opt/mrcdrl/bin/python install \
-    --find-links /wheels "$(grep '^torch==' constraints.txt)"
+# Where PyTorch comes from: its own index of builds for CPUs, or with "" pip's index, which also serves
+# where that one cannot be reached.
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+RUN --mount=type=bind,from=wheels,target=/wheels \
+    torch="pip --python /opt/mrcdrl/bin/python install --no-deps --find-links /wheels $(grep '^torch==' constraints.txt)" \
+ && { $torch ${TORCH_INDEX:+--index-url $TORCH_INDEX --retries 0 --timeout 5} \
+   || { test -n "$TORCH_INDEX" \
+     && echo "$TORCH_INDEX has no PyTorch for this machine, or cannot be reached: taking that of pip's index" \
+     && $torch; }; }
 RUN pip --python /opt/mrcdrl/bin/python install '.[arena,learn]'
 COPY common common
 COPY services services

@@ -5,17 +5,24 @@ BIN := $(VENV)/bin
 CONFIG ?= quick
 ROBOTS ?= 2
 ARGS ?=
+# Where PyTorch comes from: its own index of builds for CPUs or, where there is a GPU, pip's index. If it
+# cannot be reached, that is known soon, and pip's index serves.
+TORCH_INDEX ?= $(shell nvidia-smi --list-gpus >/dev/null 2>&1 || echo https://download.pytorch.org/whl/cpu)
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+TORCH = --no-deps $$(grep '^torch==' constraints.txt)
+NO_TORCH = $(TORCH_INDEX) has no PyTorch for this machine, or cannot be reached: taking that of pip's index
 
 .PHONY: install train test lint format bench wheel clean
 
 install: $(VENV)/installed
 
-# torch first, by its exact version: pip then takes the build that fits this machine.
+# torch first, by its exact version: what depends on it then takes the build that is there.
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "mrcdrl needs Python 3.11 or newer: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $$(grep '^torch==' constraints.txt)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) $(TORCH) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX) --retries 0 --timeout 5 2>/dev/null) || \
+	  { test -n "$(TORCH_INDEX)" && echo "$(NO_TORCH)" && $(PIP) $(TORCH); }
+	$(PIP) -c constraints.txt -e '.[dev]'
 	touch $@
 
 train: install
