@@ -28,8 +28,9 @@ $(VENV)/installed: pyproject.toml constraints.txt
 train: install
 	$(BIN)/mrcdrl train --config $(CONFIG) --robots $(ROBOTS) $(ARGS)
 
+# A worker for each core, at most four, each with a file of tests at a time; ARGS="-n 0" runs them in one process.
 test: install
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: install
 	$(BIN)/ruff format --check .

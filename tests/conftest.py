@@ -9,11 +9,20 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.services.tools.certs import HOSTS, ROLES
+
+MAX_WORKERS = 4  # each may start runs, whose processes fill several cores
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is first imported
 settings.register_profile("shared cores", deadline=None)  # waiting for a core is not a slow example
 settings.load_profile("shared cores")
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_auto_num_workers() -> int:
+    """Workers of `--numprocesses auto`: one for each core."""
+    return min(available_cores(), MAX_WORKERS)
 
 
 @pytest.fixture

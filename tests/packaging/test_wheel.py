@@ -96,7 +96,8 @@ def reuse_compiled(package: Path) -> None:
         source = index.parents[1] / f"{index.name.split('.')[0]}.py"
         shutil.copystat(source, package / source.relative_to(ROOT))
     for cache in {index.parent for index in indexes}:
-        shutil.copytree(cache, package / cache.relative_to(ROOT))
+        unfinished = shutil.ignore_patterns("*.tmp.*")  # of tests that compile meanwhile
+        shutil.copytree(cache, package / cache.relative_to(ROOT), ignore=unfinished)
 
 
 def test_the_wheel_holds_mrcdrl_alone(built: tuple[Path, Path]) -> None:

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
+from pydantic import TypeAdapter
 
 from tests.system.system_processes import (
     Command,
@@ -15,11 +17,25 @@ from tests.system.system_processes import (
     smoke_training,
 )
 
+_FINISHED = TypeAdapter(Finished)
+
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """A run of `mrcdrl train --config smoke` without a terminal."""
-    folder = tmp_path_factory.mktemp("finished")
+def finished(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Finished:
+    """A run of `mrcdrl train --config smoke` without a terminal, one for all workers of pytest."""
+    shared = tmp_path_factory.getbasetemp()
+    if hasattr(request.config, "workerinput"):  # pytest-xdist's: each worker has a folder in it
+        shared = shared.parent
+    kept = shared / "finished.json"
+    with FileLock(shared / "finished.lock"):
+        if not kept.exists():
+            folder = shared / "finished"
+            folder.mkdir()
+            kept.write_bytes(_FINISHED.dump_json(_train(folder)))
+    return _FINISHED.validate_json(kept.read_bytes())
+
+
+def _train(folder: Path) -> Finished:
     name, mapped = run_name("smoke"), set[Path]()
 
     def ended() -> bool:
