@@ -28,7 +28,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 train: install
 	$(BIN)/mrcdrl train --config $(CONFIG) --robots $(ROBOTS) $(ARGS)
 
-# A worker for each core, at most four, each with a file of tests at a time; ARGS="-n 0" runs them in one process.
+# By several processes, each with a file of tests at a time; ARGS="-n 0" runs all in one.
 test: install
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder $(ARGS)
 

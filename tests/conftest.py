@@ -12,7 +12,7 @@ from hypothesis import settings
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.services.tools.certs import HOSTS, ROLES
 
-MAX_WORKERS = 4  # each may start runs, whose processes fill several cores
+MAX_WORKERS = 4  # each may start a run, whose processes fill several cores
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is first imported
 settings.register_profile("shared cores", deadline=None)  # waiting for a core is not a slow example
@@ -21,8 +21,13 @@ settings.load_profile("shared cores")
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """Workers of `--numprocesses auto`: one for each core."""
-    return min(available_cores(), MAX_WORKERS)
+    """Workers of `--numprocesses auto`: one more than cores, as tests of processes wait a lot."""
+    return min(available_cores() + 1, MAX_WORKERS)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the containers: they wait the longest, and all else can run beside them."""
+    items.sort(key=lambda item: "compose" not in item.path.parts)
 
 
 @pytest.fixture

@@ -95,6 +95,14 @@ class Command:
         """The exit code."""
         return self.process.wait(timeout_s)
 
+    def wait_without_plots(self) -> int:
+        """The exit code of a run that is asked, once it has ended, for neither plots nor video."""
+        eventually(
+            lambda: "writing plots" in self.err or self.process.poll() is not None, "the run ends"
+        )
+        self.signal(signal.SIGINT)
+        return self.wait()
+
     def end(self) -> int:
         """Ask it to stop, insist after a while."""
         if self.process.poll() is None:

@@ -17,7 +17,7 @@ def test_a_prioritized_run_ends_well_and_has_set_priorities(tmp_path: Path) -> N
     brief = ["--learner-steps", "600", "--run.evaluators", "0"]
     try:
         with Command([*arguments, *prioritized, *brief], tmp_path) as train:
-            assert train.wait() == 0, train.err
+            assert train.wait_without_plots() == 0, train.err
         assert processes_of(name) == {}
     finally:
         end_all(name)

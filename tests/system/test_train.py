@@ -127,7 +127,7 @@ def test_resume_goes_on_until_interrupted(finished: Finished, tmp_path: Path) ->
         )
         eventually(lambda: len(read_episodes(run)) > episodes, "episodes appended")
         train.signal(signal.SIGINT)
-        assert train.wait() == 0, train.err
+        assert train.wait_without_plots() == 0, train.err
     assert "stopping (Ctrl-C) …" in train.err
     assert "Traceback" not in train.err
     no_trace_of(name, run)
