@@ -38,17 +38,21 @@ def main(argv: Sequence[str]) -> int:
         stats = session.publisher(keys.stats("replay", serving.worker))
         reporter = StatsReporter(stats, "replay", serving.worker)
         service = ReplayService(config, table, limiter, inserts, samples, priorities, log)
-        service.recover()
+        shared = to_toml(config).encode()
+
+        def serve_config(timeout_s: float = 0.0) -> None:
+            request = config_requests.take(timeout_s)
+            if request is not None:
+                request.reply(shared)
+
+        service.recover(meanwhile=serve_config)
         service.start()
         session.announce(keys.live("replay", serving.worker))
         _LOG.info("serving %s, %d of %d transitions", serving.run, len(table), table.capacity)
-        shared = to_toml(config).encode()
         leases = LeaseTable(config.exploration.lease_s, config.exploration.slots, time.monotonic())
         try:
             while not stop.is_set() and service.healthy:
-                request = config_requests.take(_TICK_S)
-                if request is not None:
-                    request.reply(shared)
+                serve_config(_TICK_S)
                 if lease_requests is not None:
                     answer_leases(lease_requests, leases)
                 if service.accepting:

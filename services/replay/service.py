@@ -112,8 +112,11 @@ class ReplayService:
             ),
         ]
 
-    def recover(self) -> None:
-        """Restore what earlier processes kept in the log and a snapshot; call before `start`."""
+    def recover(self, meanwhile: Callable[[], None] = lambda: None) -> None:
+        """Restore what earlier processes kept in the log and a snapshot; call before `start`.
+
+        meanwhile: called after each chunk, as a long log takes minutes to read.
+        """
         if self._log is None:
             return
         self._table.number_from(self._log.first_key)
@@ -128,6 +131,7 @@ class ReplayService:
             except WireError as error:
                 self._counts["refused"] += 1
                 left_out = str(error)
+            meanwhile()
         if left_out:
             count = self._counts["refused"]
             _LOG.warning("%d chunks in the log were left out; the last: %s", count, left_out)

@@ -3,7 +3,7 @@
 import dataclasses
 import queue
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +97,14 @@ class FakeRequest:
         return self.answers.get(timeout=PATIENCE_S)
 
 
-def start(directory: Path, config: Config = CONFIG) -> ReplayService:
+def start(
+    directory: Path, config: Config = CONFIG, meanwhile: Callable[[], None] = lambda: None
+) -> ReplayService:
     """A service that has read back its log and snapshot, and whose threads do not run."""
     table, limiter = Table.from_config(config), RateLimiter.from_config(config)
     log = open_log(config, directory)
     service = ReplayService(config, table, limiter, *[NoServer()] * 3, log)
-    service.recover()
+    service.recover(meanwhile)
     return service
 
 

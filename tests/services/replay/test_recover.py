@@ -106,3 +106,10 @@ def test_a_stream_throttled_from_its_first_chunk_on_is_new(
     insert(service, make_chunk(0))
     assert service.metrics().duplicates == 0
     assert service.metrics().size == 16
+
+
+def test_who_joins_while_a_long_log_is_read_need_not_wait(tmp_path: Path) -> None:
+    asked: list[int] = []
+    insert(start(tmp_path), *map(make_chunk, range(3)))
+    start(tmp_path, meanwhile=lambda: asked.append(1))
+    assert len(asked) == 3
