@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from mrcdrl.common.config import load_config, to_toml
 from mrcdrl.common.errors import CheckpointError, ConfigError
@@ -71,11 +73,28 @@ def test_missing_weights_are_refused(tmp_path: Path) -> None:
         named(tmp_path / "none.safetensors")
 
 
-@pytest.mark.parametrize("content", [b"", b"no safetensors", b"\x08" + b"\x00" * 7 + b"{}      "])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"no safetensors",
+        b"\x08" + b"\x00" * 7 + b"{}      ",
+        save({"conv": np.zeros((3, 3), np.float32)}, {"format": "pt"}),
+    ],
+)
 def test_foreign_bytes_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "foreign.safetensors").write_bytes(content)
-    with pytest.raises(CheckpointError):
-        named(tmp_path / "foreign.safetensors")
+    with pytest.raises(CheckpointError, match=r"weights|unreadable"):
+        named(tmp_path / "foreign.safetensors", VIEW)
+
+
+def test_weights_cut_off_or_of_another_type_are_refused(tmp_path: Path, payload: bytes) -> None:
+    file = tmp_path / "some.safetensors"
+    for changed in (payload[: len(payload) // 2], payload.replace(b'"F32"', b'"F64"')):
+        assert changed != payload
+        file.write_bytes(changed)
+        with pytest.raises(CheckpointError, match=r"weights|unreadable"):
+            named(file, VIEW)
 
 
 def test_weights_of_another_view_are_refused(tmp_path: Path, payload: bytes) -> None:
