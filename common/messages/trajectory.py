@@ -26,6 +26,8 @@ BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
 NUM_ACTIONS = 3  # left, straight, right (paper section 3)
 NO_SLOT = -1  # an actor without an exploration slot
+DOING = "doing"  # a text in Stats: what keeps a service from its work
+COMPILING = "compiling"  # its functions, once
 
 
 class StepType(IntEnum):

@@ -1,4 +1,4 @@
-"""Functions that numba compiles: with one set of options, and kept on disk where possible."""
+"""Functions that numba compiles: with one set of options, kept on disk where possible."""
 
 import logging
 from collections.abc import Callable
@@ -6,6 +6,9 @@ from functools import cache
 from typing import Any
 
 from numba import njit
+from numba.core import event
+
+from mrcdrl.common.runtime.compiling import began, ended
 
 _LOG = logging.getLogger("numba")
 
@@ -39,3 +42,29 @@ def _warn_once() -> None:
         "no directory for compiled functions can be written: each start compiles them anew, which "
         "takes a minute; set NUMBA_CACHE_DIR to one that can"
     )
+
+
+@cache
+def _say_once() -> None:
+    _LOG.info("compiling functions, which takes a minute and is done once …")
+
+
+class _Reporter(event.Listener):
+    """Notes each compilation of a function of ours; those of numba's own belong to one."""
+
+    def on_start(self, event: Any) -> None:
+        if _is_ours(event):
+            _say_once()
+            began()
+
+    def on_end(self, event: Any) -> None:
+        if _is_ours(event):
+            ended()
+
+
+def _is_ours(event: Any) -> bool:
+    module: str = event.data["dispatcher"].py_func.__module__
+    return module.startswith("mrcdrl.")
+
+
+event.register("numba:compile", _Reporter())  # type: ignore[no-untyped-call]

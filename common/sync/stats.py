@@ -1,13 +1,18 @@
-"""Statistics: a service publishes its metrics once a second, and keeps its heartbeat."""
+"""Statistics: a service publishes its metrics once a second, and keeps its heartbeat.
+
+Invariant: while a function is being compiled, which may hold up the main loop, they say so.
+"""
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 
 from mrcdrl.common.errors import TransportError
 from mrcdrl.common.messages.metrics import Metrics, numbers
-from mrcdrl.common.messages.trajectory import Stats
+from mrcdrl.common.messages.trajectory import COMPILING, DOING, Stats
 from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.runtime.compiling import compiling, tell_compiling
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.versions import versions
 from mrcdrl.common.transport import Publisher
@@ -26,9 +31,12 @@ class StatsReporter:
         self._role = role
         self._worker = worker
         self._text = {"incarnation": str(time.time_ns()), **versions()}
+        self._metrics: dict[str, float] = {}  # as last published
         self._heartbeat = Heartbeat.from_environment()
         self._patience_s = _WARM_UP_S if warms_up else 0.0
         self._due_s = 0.0
+        self._lock = threading.Lock()
+        tell_compiling(self._publish_compiling)
 
     def warmed_up(self) -> None:
         """Note that the first work is done: from now on a long silence is a hang."""
@@ -45,11 +53,24 @@ class StatsReporter:
 
     def publish(self, metrics: Callable[[], Metrics]) -> None:
         """Publish now, whether due or not."""
+        self._metrics = numbers(metrics())
+        self._publish()
+
+    def _publish_compiling(self) -> None:
+        """Publish, from any thread, that this process compiles; at most once a second."""
+        self._heartbeat.worked()
+        if time.monotonic() >= self._due_s:
+            self._publish()
+
+    def _publish(self) -> None:
         self._due_s = time.monotonic() + 1.0
+        text = {**self._text, "clock_ns": str(time.time_ns())}
+        if compiling():
+            text[DOING] = COMPILING
         try:
-            text = {**self._text, "clock_ns": str(time.time_ns())}
-            stats = Stats(self._role, self._worker, numbers(metrics()), text)
-            self._publisher.put(encode(stats))
+            with self._lock:
+                stats = Stats(self._role, self._worker, self._metrics, text)
+                self._publisher.put(encode(stats))
         except TransportError as error:
             logging.getLogger(self._role).warning("statistics not published: %s", error)
         self._heartbeat.beat(self._patience_s)

@@ -45,6 +45,9 @@ class Evaluator:
         self._settings = config.evaluator
         self._stop = stop
         self._after_first = after_first
+        self._reporter = StatsReporter(
+            session.publisher(keys.stats("evaluator", worker)), "evaluator", worker, warms_up=True
+        )
         self._evaluator = WeightsEvaluator(config, worker)
         self._reader = WeightsReader(session, keys, self._evaluator.adopt)
         confirmer = WeightsEvaluator(confirming(config), worker)
@@ -53,9 +56,6 @@ class Evaluator:
             lambda weights: confirmer.evaluate(weights, self._before_frame),
         )
         self._publisher = session.publisher(keys.evaluation(worker))
-        self._reporter = StatsReporter(
-            session.publisher(keys.stats("evaluator", worker)), "evaluator", worker, warms_up=True
-        )
         self._frames = 0  # each of many arenas
         self._evaluations = 0
         self._version = -1

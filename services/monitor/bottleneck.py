@@ -5,25 +5,10 @@ where the side that is waited for spends its time.
 """
 
 from mrcdrl.common.messages.metrics import ActorMetrics, LearnerMetrics, ReplayMetrics
+from mrcdrl.services.monitor.phase import progress
 from mrcdrl.services.monitor.state import RunState
 
 HELD = 0.2  # share of the reports from which a limiter counts as throttling
-
-
-def thousands(number: float) -> str:
-    """5000 as "5 000", with no-break spaces."""
-    return f"{number:,.0f}".replace(",", "\N{NO-BREAK SPACE}")
-
-
-def waiting_for(state: RunState) -> str | None:
-    """What has to happen before the ring can turn; None if it turns."""
-    for role, name in (("replay", "replay"), ("actor", "an actor"), ("learner", "the learner")):
-        if not state.alive(role):
-            return f"waiting for {name} to start"
-    size, needed = state.replay_size, state.config.replay.min_size
-    if size < needed:
-        return f"waiting for replay to fill ({thousands(size)} of {thousands(needed)})"
-    return None
 
 
 def bottleneck(state: RunState) -> str:
@@ -46,9 +31,4 @@ def bottleneck(state: RunState) -> str:
             "learner decoding of batches": learner.decode_share,
             "learner publishing of weights": learner.publish_share,
         }
-    return waiting_for(state) or max(shares, key=lambda stage: shares[stage])
-
-
-def bottleneck_line(state: RunState) -> str:
-    """The bottleneck named as such, or what the run waits for."""
-    return waiting_for(state) or f"bottleneck: {bottleneck(state)}"
+    return progress(state).waiting_for or max(shares, key=lambda stage: shares[stage])

@@ -8,6 +8,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 from rich.console import Console
@@ -26,14 +27,16 @@ Show = Callable[[], None]
 @contextmanager
 def display(
     state: RunState,
-    name: str,
+    run_dir: Path,
+    keys: str,
     clock: Callable[[], float],
     watching: Watching,
     lines: Show | None = None,
 ) -> Iterator[Show]:
     """Yield a function that shows the state now: on a live screen, or as a plain line.
 
-    watching: guards all that is written. lines: what to call instead of both.
+    keys: what Ctrl-C does. watching: guards all that is written. lines: what to call instead of
+    both.
     """
     shown = ExitStack()
     draw = lines or _plain(state, clock)
@@ -50,7 +53,7 @@ def display(
 
     with watching(_PART):
         if lines is None and can_draw(console := OpenConsole()):
-            draw = shown.enter_context(_screen(console, state, name, clock))
+            draw = shown.enter_context(_screen(console, state, run_dir, keys, clock))
     try:
         yield show
     finally:
@@ -81,10 +84,10 @@ def _plain(state: RunState, clock: Callable[[], float]) -> Show:
 
 @contextmanager
 def _screen(
-    console: Console, state: RunState, name: str, clock: Callable[[], float]
+    console: Console, state: RunState, run_dir: Path, keys: str, clock: Callable[[], float]
 ) -> Iterator[Show]:
     with logging_to(state), Live(console=console, screen=True, auto_refresh=False) as live:
-        yield lambda: live.update(Screen(state, clock(), name), refresh=True)
+        yield lambda: live.update(Screen(state, clock(), run_dir, keys), refresh=True)
 
 
 def _nothing() -> None:

@@ -4,24 +4,31 @@ Invariants: pure, built from RunState and `now` alone; fills the console's rows 
 80 x 24; nothing scrolls. Curves are in braille: two points a column, four levels a row.
 """
 
-import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from mrcdrl.services.monitor.bottleneck import bottleneck, bottleneck_line, thousands, waiting_for
+from mrcdrl.common.runtime.names import printable
+from mrcdrl.services.monitor.bottleneck import bottleneck
+from mrcdrl.services.monitor.phase import Phase, progress, thousands
+from mrcdrl.services.monitor.records import SUCCESS_WINDOW
 from mrcdrl.services.monitor.service_table import ROLE_STYLES, services
-from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.state import HISTORY_PERIOD, RunState
 
-FIXED_ROWS = 9  # header, ring, fill, epsilon and the headings
+FIXED_ROWS = 12  # header, phase, ring, fill, epsilon, axes, footer and the headings
+Point = tuple[float, float]
 BAR = "━"
 # Bits of the dots of U+2800, [column 0 or 1][row 0 (top) ... 3].
 _DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
-_BLANK = 0x2800
+_BLANK = 0x2800  # shown as a space, which every font has
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,23 +37,26 @@ class Screen:
 
     state: RunState
     now: float
-    name: str  # of the run
+    run_dir: Path
+    keys: str = ""  # what Ctrl-C does
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        rows = Rows.of(options.height or console.size.height, len(self.state.services))
-        width = options.max_width
+        state, now, width = self.state, self.now, options.max_width
+        rows = Rows.of(options.height or console.size.height, state)
         lines: list[RenderableType] = [
-            header(self.state, self.now, self.name, width),
-            *ring(self.state, self.now),
+            header(state, now, self.run_dir.name, width),
+            phase(state),
+            *ring(state, now),
             heading("processes"),
-            services(self.state, self.now, rows.services),
-            fill(self.state, width),
-            exploration(self.state),
-            curves(self.state, width, rows.curve),
+            services(state, now, rows.services),
+            fill(state, width),
+            exploration(state),
+            curves(state, now, width, rows.curve),
             heading("evaluations", "newest first, with the 95 % interval"),
-            evaluations(self.state, rows.evaluations),
-            limit(self.state),
-            log(self.state, rows.log),
+            evaluations(state, rows.evaluations),
+            limit(state),
+            log(state, rows.log),
+            footer(self.run_dir, "" if state.ending else self.keys, width),
         ]
         yield Group(*lines)
 
@@ -61,14 +71,15 @@ class Rows:
     log: int
 
     @classmethod
-    def of(cls, height: int, num_services: int) -> "Rows":
-        """Divide the console's height: services first, then curves, then the rest."""
+    def of(cls, height: int, state: RunState) -> "Rows":
+        """Divide the console's height: what each list needs, within bounds; the curves get the
+        rest."""
         free = max(8, height - FIXED_ROWS)
-        services = min(max(num_services, 1), max(4, free * 2 // 5))
+        services = min(max(len(state.services), 1), max(4, free * 2 // 5))
         rest = free - services
-        curve = min(8, max(2, rest * 2 // 5))
-        log = max(1, (rest - curve) * 2 // 5)
-        return cls(services, curve, max(1, rest - curve - log), log)
+        log = min(max(len(state.log), 1), max(1, rest // 5))
+        evaluations = min(max(len(state.evaluations), 1), max(1, (rest - log) * 2 // 5))
+        return cls(services, rest - log - evaluations, evaluations, log)
 
 
 def clock(seconds: float | None) -> str:
@@ -93,27 +104,48 @@ def header(state: RunState, now: float, name: str, width: int) -> Text:
     """One bar with the run's name, arena and agent, its time and the time left."""
     config = state.config
     robots = f"{config.arena.num_robots} robot{'s' * (config.arena.num_robots != 1)}"
-    left = f" mrcdrl  {name}  {robots} · {config.agent.kind}"
+    left = f" mrcdrl  {printable(name)}  {robots} · {config.agent.kind}"
     left += f" · {config.arena.target_layout} targets"
     remaining = state.time_left_s(now)
-    right = told(state, now) + (f"  {clock(remaining)} left " if remaining is not None else " ")
-    room = max(0, width - len(right) - 1)
-    return Text(f"{left[:room]:<{room}} {right}", style="bold white on grey23", no_wrap=True)
+    right = f" {told(state, now)}" + (
+        f"  {clock(remaining)} left " if remaining is not None else " "
+    )
+    return at_both_ends(left, right, width, "bold white on grey23")
+
+
+def footer(run_dir: Path, keys: str, width: int) -> Text:
+    """One line with the run's folder, and what Ctrl-C does."""
+    return at_both_ends(f"folder {printable(str(run_dir))}", f" {keys}", width, "grey62")
+
+
+def at_both_ends(left: str, right: str, width: int, style: str) -> Text:
+    """One line of `width` cells; where both do not fit, the left text is cut."""
+    line = Text(left, style=style, no_wrap=True, overflow="ellipsis")
+    line.truncate(max(0, width - cell_len(right)), overflow="ellipsis", pad=True)
+    return line.append(right)
+
+
+def phase(state: RunState) -> Text:
+    """What the run is doing, or what it waits for."""
+    now = progress(state)
+    style = "bold green" if now.phase is Phase.LEARNING else "bold yellow"
+    words, rest = str(now.phase), str(now).removeprefix(now.phase)
+    return Text(no_wrap=True, overflow="ellipsis").append(words, style=style).append(rest)
 
 
 def ring(state: RunState, now: float) -> list[Text]:
     """The ring with the rate on each arrow, and the counters below."""
     rate = {n: state.per_second(n, now) for n in ("robot_steps", "samples", "learner_steps")}
     line = Text(no_wrap=True, overflow="ellipsis").append("↻ ", style="grey62")
-    _stage(line, state, "actor", "actors")
+    _stage(line, state, "actor")
     line.append(f" ─{thousands(rate['robot_steps'])}/s→ ", style="white")
-    _stage(line, state, "replay", "replay")
+    _stage(line, state, "replay")
     line.append(f" ─{thousands(rate['samples'])}/s→ ", style="white")
-    _stage(line, state, "learner", "learner")
+    _stage(line, state, "learner")
     line.append(f" ─{rate['learner_steps']:.0f}/s→ ", style="white")
     line.append(f"weights v{state.weights_version}", style="bold yellow")
     line.append(" → ", style="white")
-    _stage(line, state, "evaluator", "evaluator")
+    _stage(line, state, "evaluator")
     counters = (
         f"{thousands(state.env_steps)} env steps · {thousands(state.robot_steps)} robot steps · "
         f"{thousands(state.learner_steps)} learner steps · "
@@ -122,10 +154,11 @@ def ring(state: RunState, now: float) -> list[Text]:
     return [line, Text(counters, style="grey62", no_wrap=True, overflow="ellipsis")]
 
 
-def _stage(line: Text, state: RunState, role: str, name: str) -> None:
+def _stage(line: Text, state: RunState, role: str) -> None:
     count = len(state.alive(role))
+    name = f"{count} actor{'s' * (count != 1)}" if role == "actor" else role
     style = f"bold {ROLE_STYLES[role]}" if count else "bold red"
-    line.append(f"{count} {name}" if role == "actor" else name, style=style)
+    line.append(name if count else f"no {role}", style=style)
 
 
 def fill(state: RunState, width: int) -> Text:
@@ -156,73 +189,106 @@ def exploration(state: RunState) -> Text:
     return line.append(f"{successes} successes in the last {of}", style="bold")
 
 
-def curves(state: RunState, width: int, height: int) -> Table:
-    """Successes per 100 episodes and evaluation success, side by side."""
+def curves(state: RunState, now: float, width: int, height: int) -> Table:
+    """Successes per 100 episodes over episodes, and evaluation success over minutes."""
     table = Table.grid(expand=True, padding=(0, 1, 0, 0))
     table.add_column(ratio=1)
     table.add_column(ratio=1)
     inner = max(8, width // 2 - 6)
-    tests = [100 * record.evaluation.success_rate for record in state.evaluations]
+    training = [
+        (SUCCESS_WINDOW + HISTORY_PERIOD * i, float(successes))
+        for i, successes in enumerate(state.success_history)
+    ]
+    tests = [(r.time_s / 60, 100 * r.evaluation.success_rate) for r in state.evaluations]
+    rates = [rate for _, rate in tests]
     now_and_best = state.successes_per_100 is not None
-    training = f"{state.successes_per_100}, best {state.max_successes}" if now_and_best else "–"
-    testing = f"{tests[-1]:.1f} %, best {max(tests):.1f} %" if tests else "–"
+    trained = f"{state.successes_per_100}, best {state.max_successes}" if now_and_best else "–"
+    tested = f"{rates[-1]:.1f} %, best {max(rates):.1f} %" if tests else "–"
     table.add_row(
-        heading("successes per 100", training, "cyan"),
-        heading("evaluation", testing, "green"),
+        heading("successes per 100", trained, "cyan"),
+        heading("test success", tested, "green"),
     )
     table.add_row(
-        _curve(state.success_history, inner, height, "cyan"),
-        _curve(tests, inner, height, "green"),
+        _plot(training, max(state.episodes, SUCCESS_WINDOW), "episodes", inner, height, "cyan"),
+        _plot(tests, max(now / 60, 1.0), "min", inner, height, "green"),
     )
     return table
 
 
-def _curve(values: Sequence[float], width: int, height: int, style: str) -> Text:
+def _plot(
+    points: Sequence[Point], right: float, unit: str, width: int, height: int, style: str
+) -> Text:
+    """A curve with its axes: 0 ... 100 upwards, 0 ... right across."""
+    labels = {_row(value, height): str(value) for value in _ticks(height)}
     text = Text(no_wrap=True)
-    for row, line in enumerate(braille_curve(values, width, height, 0, 100)):
-        label = "100" if row == 0 else "  0" if row == height - 1 else "   "
-        edge = "┤" if label.strip() else "│"
-        text.append(f"{label}{edge}", style="grey50").append(line, style=style)
-        text.append("\n" if row < height - 1 else "")
-    return text
+    for row, line in enumerate(braille_curve(points, right, width, height)):
+        label = labels.get(row, "")
+        text.append(f"{label:>3}{'┤' if label else '│'}", style="grey50")
+        text.append(f"{line}\n", style=style)
+    return text.append(f"   └{_x_axis(right, unit, width)}", style="grey50")
 
 
-def resample(values: Sequence[float], num_points: int) -> list[float]:
-    """Means over equal groups of many values, linear interpolation between few."""
-    count = len(values)
-    if count == 0:
-        return []
-    if count < num_points:
-        return [_between(values, i * (count - 1) / (num_points - 1)) for i in range(num_points)]
-    bounds = [i * count // num_points for i in range(num_points + 1)]
-    return [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(bounds)]
+def _ticks(height: int) -> tuple[int, ...]:
+    """The values that the axis upwards names."""
+    if height >= 9:
+        return (0, 25, 50, 75, 100)
+    return (0, 50, 100) if height >= 3 else (0, 100)
 
 
-def _between(values: Sequence[float], position: float) -> float:
-    """The value at a position between two indices."""
-    index = min(int(position), len(values) - 1)
-    after = min(index + 1, len(values) - 1)
-    return values[index] + (position - index) * (values[after] - values[index])
+def _row(value: float, height: int) -> int:
+    """The row of a value of 0 ... 100, from the top."""
+    top = 4 * height - 1
+    return (top - round(value / 100 * top)) // 4
 
 
-def braille_curve(
-    values: Sequence[float], width: int, height: int, low: float, high: float
-) -> list[str]:
-    """The curve of `values` between low and high, in `height` lines of `width` characters.
+def _x_axis(right: float, unit: str, width: int) -> str:
+    """The axis across, named at its left end, at a round number near its middle, at its right."""
+    end = f" {thousands(right)} {unit}"
+    line = "0 ".ljust(max(0, width - len(end)), "─")
+    digits = -math.floor(math.log10(right / 2))
+    middle = round(right / 2, digits)
+    label = f" {thousands(middle)} "
+    begin = round(middle / right * (width - 1)) - len(label) // 2
+    if digits <= 0 and begin > 2 and begin + len(label) < len(line):
+        line = line[:begin] + label + line[begin + len(label) :]
+    return line + end
+
+
+def resample(points: Sequence[Point], right: float, num: int) -> list[float | None]:
+    """The values at `num` places spread evenly over 0 ... right.
+
+    Means where several points fall on one place, linear between points, None outside them.
+    """
+    finite = [point for point in points if np.isfinite(point).all()]
+    if not finite:
+        return [None] * num
+    xs, ys = np.array(finite).T
+    places = np.clip(xs / right * (num - 1), 0, num - 1)
+    nearest = np.rint(places).astype(int)
+    counts = np.bincount(nearest, minlength=num)
+    sums = np.bincount(nearest, ys, num)
+    known = np.flatnonzero(counts)
+    values = np.interp(np.arange(num), known, sums[known] / counts[known])
+    return [float(v) if known[0] <= x <= known[-1] else None for x, v in enumerate(values)]
+
+
+def braille_curve(points: Sequence[Point], right: float, width: int, height: int) -> list[str]:
+    """The curve of `points`, x in 0 ... right and y in 0 ... 100, in `height` lines.
 
     Neighbouring points are joined by vertical strokes; values outside are drawn at the edge.
     """
     cells = [[_BLANK] * width for _ in range(height)]
     top = 4 * height - 1
     before: int | None = None
-    for x, value in enumerate(resample(values, 2 * width)):
-        fraction = min(1.0, max(0.0, (value - low) / (high - low)))
-        level = top - round(fraction * top)
+    for x, value in enumerate(resample(points, right, 2 * width)):
+        if value is None:
+            continue
+        level = top - round(min(100.0, max(0.0, value)) / 100 * top)
         start = level if before is None else before + (level > before) - (level < before)
         for y in range(min(start, level), max(start, level) + 1):
             cells[y // 4][x // 2] |= _DOTS[x % 2][y % 4]
         before = level
-    return ["".join(map(chr, row)) for row in cells]
+    return ["".join(map(chr, row)).replace(chr(_BLANK), " ") for row in cells]
 
 
 def evaluations(state: RunState, num_rows: int) -> Text:
@@ -242,9 +308,10 @@ def evaluations(state: RunState, num_rows: int) -> Text:
 
 
 def limit(state: RunState) -> Rule:
-    """The bottleneck, or what the run waits for; heads the log."""
-    waiting = waiting_for(state)
-    return heading(waiting or "bottleneck", "" if waiting else bottleneck(state), "yellow")
+    """The bottleneck, once the ring turns; heads the log."""
+    return heading(
+        "bottleneck", "–" if progress(state).waiting_for else bottleneck(state), "yellow"
+    )
 
 
 def log(state: RunState, num_rows: int) -> Text:
@@ -258,8 +325,10 @@ def plain_line(state: RunState, now: float) -> str:
     successes, of = state.recent_successes
     last = state.last_evaluation
     test = f"{last.evaluation.success_rate:.1%}" if last else "–"
+    doing = progress(state)
     fields = [
         told(state, now),
+        str(doing),
         f"{len(state.alive('actor'))} actors",
         f"robot steps {state.robot_steps} ({state.per_second('robot_steps', now):.0f}/s)",
         f"replay {state.replay_size}/{state.replay_capacity}",
@@ -267,9 +336,10 @@ def plain_line(state: RunState, now: float) -> str:
         f"weights v{state.weights_version}",
         f"successes {successes}/{of}",
         f"evaluation {test}",
-        bottleneck_line(state),
     ]
+    if not doing.waiting_for:
+        fields.append(f"bottleneck: {bottleneck(state)}")
     remaining = state.time_left_s(now)
     if remaining is not None:
-        fields.insert(1, f"{clock(remaining)} left")
+        fields.insert(2, f"{clock(remaining)} left")
     return "  ".join(fields).replace("\N{NO-BREAK SPACE}", " ")

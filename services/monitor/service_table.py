@@ -15,7 +15,7 @@ from mrcdrl.common.messages.metrics import (
     LearnerMetrics,
     ReplayMetrics,
 )
-from mrcdrl.services.monitor.bottleneck import thousands
+from mrcdrl.services.monitor.phase import thousands
 from mrcdrl.services.monitor.state import WITHOUT_METRICS, RunState, Service
 
 QUIET_S = 5.0  # a service that reports nothing for this long is shown as silent
@@ -71,14 +71,16 @@ def heard(service: Service, now: float) -> Text:
         return Text("lost", style="bold red")
     if service.role in WITHOUT_METRICS:
         return Text("up", "green")
+    if service.compiling:
+        return Text("compiling", style="yellow")
     if silent == float("inf"):
         return Text("starting", style="yellow")
     return Text(f"silent {silent:.0f} s", "yellow") if silent > QUIET_S else Text("up", "green")
 
 
 def figures(state: RunState, service: Service, now: float) -> str:
-    """A service's key figures in one line."""
-    if service.heard_s is None:
+    """A service's key figures in one line; empty before it has any."""
+    if service.heard_s is None or (service.compiling and not service.metrics):
         return ""
     match service.role:
         case "actor":

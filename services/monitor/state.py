@@ -13,7 +13,16 @@ from types import MappingProxyType
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.metrics import M, of_kind, read
-from mrcdrl.common.messages.trajectory import NO_SLOT, EpisodeSummary, Evaluation, Outcome, Stats
+from mrcdrl.common.messages.trajectory import (
+    COMPILING,
+    DOING,
+    NO_SLOT,
+    EpisodeSummary,
+    Evaluation,
+    Outcome,
+    Stats,
+)
+from mrcdrl.common.runtime.names import printable
 from mrcdrl.services.monitor.rates import Rate, Share, Spread, SpreadWindow
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW, EvaluationRecord
 
@@ -67,6 +76,11 @@ class Service:
         slot = int(self.metrics.get("slot", NO_SLOT))
         return slot if self.alive and slot != NO_SLOT else None
 
+    @property
+    def compiling(self) -> bool:
+        """Whether it compiles its functions, which keeps it from its work."""
+        return self.alive and self.text.get(DOING) == COMPILING
+
     def silent_s(self, now: float) -> float:
         """Seconds since its last stats; infinite before the first."""
         return math.inf if self.heard_s is None else max(0.0, now - self.heard_s)
@@ -79,6 +93,7 @@ class RunState:
         self.config = config
         self.resumed_at_s: float | None = 0.0  # seconds the run had lasted when it was resumed
         self.since = ""  # such as "since status started", where `now` does not count from its start
+        self.ending = ""  # why the run ends, once it does
         self.log: deque[str] = deque(maxlen=LOG_LINES)
         self.evaluations: list[EvaluationRecord] = []
         self.episodes = 0
@@ -162,8 +177,8 @@ class RunState:
         self._service(role, service_id).alive = alive
 
     def observe_log(self, line: str) -> None:
-        """Keep a warning for the screen."""
-        self.log.append(line)
+        """Keep a warning for the screen, fit to be shown."""
+        self.log.append(printable(line))
 
     def restore_counted(
         self,

@@ -23,6 +23,7 @@ from mrcdrl.common.transport import Session
 from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.display import Show, at_most_every, display
 from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.phase import progress
 from mrcdrl.services.monitor.recorder import Recorder, flat_metrics, restore
 from mrcdrl.services.monitor.records import METRICS, finite, read_last_metrics
 from mrcdrl.services.monitor.run_directory import RunDirectory
@@ -36,6 +37,7 @@ _LISTEN_S = 3.0  # every service reports once a second, and two reports make a r
 _JSON_PERIOD_S = 1.0
 _WAIT_S = 30.0  # of a watcher or recorder, for the run to come up
 _RETRY_S = 0.2
+_KEYS = "Ctrl-C ends this view; the run goes on"
 _FRESH_S = 10.0  # records are of a run that is up if they are no older; one comes every second
 
 
@@ -56,18 +58,19 @@ def main(argv: Sequence[str]) -> int:
         follower = Follower(session, joining.keys, state, recorder, rule, lasted_s)
         if not (arguments.watch or arguments.record):
             listen(follower, Heartbeat(None), stop, lambda: None, until_s=_LISTEN_S)
-            print_once(state, follower.now, joining.run, arguments.json)
+            print_once(state, follower.now, joining.run_dir, arguments.json)
             return 0
 
         def print_line() -> None:
-            print_once(state, follower.now, joining.run, as_json=True)
+            print_once(state, follower.now, joining.run_dir, as_json=True)
 
         lines = at_most_every(_JSON_PERIOD_S, lambda: follower.now, print_line)
         # Who only shows has nothing left to do once nobody reads it; a recorder goes on.
         watching = Watching(passes=() if recorder else (OSError,))
         showing = display(
             state,
-            joining.run,
+            joining.run_dir,
+            _KEYS,
             lambda: follower.now,
             watching,
             lines if arguments.json else None,
@@ -177,22 +180,25 @@ def listen(
             heartbeat.beat()
 
 
-def print_once(state: RunState, now: float, run: str, as_json: bool) -> None:
+def print_once(state: RunState, now: float, run_dir: Path, as_json: bool) -> None:
     """Print the screen, or the JSON, of this moment."""
     if as_json:
         sys.stdout.write(f"{json.dumps(status(state, now))}\n")
         sys.stdout.flush()
     else:
         console = Console()
-        console.print(Screen(state, now, run), height=console.height - 1)
+        console.print(Screen(state, now, run_dir), height=console.height - 1)
 
 
 def status(state: RunState, now: float) -> dict[str, Any]:
     """The processes, the bottleneck, and all that metrics.jsonl records of a second."""
     last = state.last_evaluation
     figures = flat_metrics(state, now).items()
+    doing = progress(state)
     values = {
         "time_since": state.since or "the run began",
+        "phase": doing.phase,
+        "evaluating_version": doing.evaluating,
         "limited_by": bottleneck(state).replace("\N{NO-BREAK SPACE}", " "),
         "services": [
             {
@@ -201,6 +207,7 @@ def status(state: RunState, now: float) -> dict[str, Any]:
                 "alive": s.alive,
                 "silent_s": round(s.silent_s(now), 6),
                 "slot": s.slot,
+                "compiling": s.compiling,
                 "versions": {name: s.text[name] for name in VERSIONED if name in s.text},
             }
             for s in state.services

@@ -8,7 +8,7 @@ import logging
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,12 +115,13 @@ class Fleet:
             with watching(f"reading {process.log_path}"):
                 yield from process.new_warnings()
 
-    def stop(self) -> None:
-        """Stop the roles in order, producers before their consumers."""
+    def stop(self, show: Callable[[], None] = lambda: None) -> None:
+        """Stop the roles in order, producers before their consumers; show the state between."""
         for role in _STOP_ORDER:
             stopping = [p for p in self._processes if p.role == role and p.popen is not None]
             if stopping:
                 _LOG.info("stopping %s …", ", ".join(p.worker for p in stopping))
+                show()
             for process in stopping:
                 self._signal(process, signal.SIGTERM)
             for process in stopping:

@@ -38,6 +38,7 @@ _TICK_S = 0.25
 _PLOTS_S = 300.0
 _JOIN_S = 60.0
 _ENOUGH_CORES = 4
+_KEYS = "Ctrl-C ends the run"
 _SHORT = {
     "arena.num_robots": "--robots",
     "run.minutes": "--minutes",
@@ -114,7 +115,7 @@ def supervise(
         if run.resumed:
             rule.go_on()
         start_workers(run, fleet, endpoint)
-        with display(state, run.path.name, lambda: follower.now, watching) as show:
+        with display(state, run.path, _KEYS, lambda: follower.now, watching) as show:
             reason = None
             while reason is None:
                 follower.listen(_TICK_S)
@@ -124,12 +125,13 @@ def supervise(
                 reason = fleet.watch() or follower.stop_reason()
                 if stop.is_set():
                     reason = stopped(stop.cause)
-        hurry.listen()
-        if stop.is_set():
-            _LOG.info("stopping (%s) …", stop.cause)
-        else:
-            _LOG.info("%s; stopping …", reason)
-        fleet.stop()
+            hurry.listen()
+            state.ending = reason
+            if stop.is_set():
+                _LOG.info("stopping (%s) …", stop.cause)
+            else:
+                _LOG.info("%s; stopping …", reason)
+            fleet.stop(show)
         follower.listen(_TICK_S)
     recorder.record_metrics(state, follower.now)
     recorder.write_summary(state, follower.now, reason)

@@ -8,6 +8,7 @@ from numba.core import caching
 
 from mrcdrl.common.runtime import compiled as module
 from mrcdrl.common.runtime.compiled import compiled, inlined
+from mrcdrl.common.runtime.compiling import compiling, tell_compiling
 
 
 @pytest.fixture
@@ -45,3 +46,51 @@ def test_with_one_they_are_kept(caplog: pytest.LogCaptureFixture) -> None:
 
     assert half._cache.cache_path
     assert caplog.messages == []
+
+
+class Listener:
+    def __init__(self) -> None:
+        self.heard: list[bool] = []
+
+    def hear(self) -> None:
+        self.heard.append(compiling())
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_compilation_is_told_when_it_begins(caplog: pytest.LogCaptureFixture) -> None:
+    def doubled(number: int) -> int:
+        return 2 * number
+
+    doubled.__module__ = "mrcdrl.somewhere"
+    fast, listener, gone = compiled(doubled), Listener(), Listener()
+    tell_compiling(listener.hear)
+    tell_compiling(gone.hear)
+    heard = gone.heard
+    del gone
+    module._say_once.cache_clear()
+    with caplog.at_level(logging.INFO):
+        assert fast(4) == 8
+        assert listener.heard == [True]
+        assert not compiling()
+        assert fast(5) == 10
+        assert listener.heard == [True]
+        assert fast(2.5) == 5.0
+    assert listener.heard == [True, True]
+    assert heard == []
+    assert [line for line in caplog.messages if "done once" in line] == [
+        "compiling functions, which takes a minute and is done once …"
+    ]
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_function_that_does_not_compile_is_told_as_ended() -> None:
+    def broken() -> int:
+        return len(3)  # type: ignore[arg-type]
+
+    broken.__module__ = "mrcdrl.somewhere"
+    listener = Listener()
+    tell_compiling(listener.hear)
+    with pytest.raises(numba.TypingError):
+        compiled(broken)()
+    assert listener.heard == [True]
+    assert not compiling()

@@ -18,6 +18,8 @@ from mrcdrl.services.monitor.display import can_draw, display, logging_to
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.watching import Watching
 
+RUN, KEYS = Path("runs/run"), "Ctrl-C ends the run"
+
 
 def test_log_lines_go_to_the_state_and_not_over_the_screen(
     capsys: pytest.CaptureFixture[str],
@@ -73,7 +75,7 @@ def test_lines_that_nobody_reads_are_given_up_and_that_is_said_once(
     os.close(reader)
     with (
         stdout_to(writer, monkeypatch),
-        display(RunState(Config()), "run", lambda: 1.0, Watching()) as show,
+        display(RunState(Config()), RUN, KEYS, lambda: 1.0, Watching()) as show,
     ):
         for _ in range(3):
             show()
@@ -87,7 +89,7 @@ def test_a_terminal_that_was_closed_ends_nothing(
     monkeypatch.setenv("TERM", "xterm-256color")
     state = RunState(Config())
     with stdout_to(slave, monkeypatch):
-        with display(state, "run", lambda: 1.0, Watching()) as show:
+        with display(state, RUN, KEYS, lambda: 1.0, Watching()) as show:
             show()
             logging.getLogger("train").warning("on the screen")
             os.close(master)
@@ -104,7 +106,7 @@ def test_a_state_that_cannot_be_drawn_is_drawn_again_when_it_can(
 ) -> None:
     monkeypatch.setattr(display_module, "_PLAIN_PERIOD_S", 0.0)
     state = RunState(Config())
-    with display(state, "run", lambda: 1.0, Watching()) as show:
+    with display(state, RUN, KEYS, lambda: 1.0, Watching()) as show:
         for steps in (7.0, float("nan"), float("nan"), 8.0):
             state.observe_stats(Stats("learner", "0", {"learner_steps": steps}), 1.0)
             show()

@@ -1,8 +1,12 @@
 """The screen at various sizes, and the plain line."""
 
 import io
+import math
+import re
+from pathlib import Path
 
 import pytest
+from rich.cells import cell_len
 from rich.console import Console
 
 from mrcdrl.common.config import load_config
@@ -42,36 +46,106 @@ def busy_state(num_actors: int) -> RunState:
     return state
 
 
-def rendered(state: RunState, width: int, height: int, now: float) -> list[str]:
+KEYS = "Ctrl-C ends the run"
+SIZES = [(80, 24), (100, 32), (120, 40), (200, 60)]
+
+
+def rendered(
+    state: RunState, width: int, height: int, now: float, run_dir: str = "runs/quick-1"
+) -> list[str]:
     console = Console(width=width, height=height, record=True, file=io.StringIO())
-    console.print(Screen(state, now, "quick-1"))
+    console.print(Screen(state, now, Path(run_dir), KEYS))
     text = console.export_text().replace("\N{NO-BREAK SPACE}", " ")
     return text.removesuffix("\n").split("\n")
 
 
-@pytest.mark.parametrize(("width", "height"), [(100, 32), (80, 24), (200, 60)])
+@pytest.mark.parametrize(("width", "height"), SIZES)
 @pytest.mark.parametrize("num_actors", [1, 3, 30])
 def test_screen_fits_and_shows_everything(width: int, height: int, num_actors: int) -> None:
     lines = rendered(busy_state(num_actors), width, height, 11.2)
-    assert len(lines) <= height
-    assert max(map(len, lines)) <= width
+    assert len(lines) == height
+    assert max(map(cell_len, lines)) <= width
     text = "\n".join(lines)
     for words in (
-        "quick-1", "4 robots", "0:19:48 left", f"{num_actors} actors ─", "replay ─7", "225/s",
+        "quick-1", "4 robots", "0:19:48 left", f"↻ {num_actors} actor", "replay ─7", "225/s",
         "weights v1207", "123 456 of 400 000", "3.98 samples per insert", "0.02 … 0.31",
         "92.9% success", "7.1% collision", "lost", "up", "processes", "bottleneck",
         "collection: actor inference", "no acknowledgement for 60 s", "1 000 episodes",
+        "test success  92.9 %, best 92.9 %",
     ):  # fmt: skip
         assert words in text, words
+    assert lines[1] == "learning"
+    assert width == 80 or "no evaluator" in lines[2]
+    assert lines[-1].startswith("folder runs/quick-1  ")
+    assert lines[-1].rstrip().endswith(KEYS)
 
 
-@pytest.mark.parametrize(("width", "height"), [(100, 32), (80, 24), (40, 10)])
+@pytest.mark.parametrize(("width", "height"), [*SIZES, (40, 10)])
 def test_screen_before_anything_is_known(width: int, height: int) -> None:
     lines = rendered(RunState(CONFIG), width, height, 0.0)
-    assert max(map(len, lines)) <= width
+    assert max(map(cell_len, lines)) <= width
     text = "\n".join(lines)
     assert text.count("none yet") == 2
-    assert "waiting for replay" in text
+    assert lines[1].startswith("starting, waiting for replay")
+    assert re.search(r"^bottleneck +– ", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_curves_have_axes_and_take_the_height_that_is_left(width: int, height: int) -> None:
+    lines = rendered(busy_state(1), width, height, 840.0)
+    axis = next(i for i, line in enumerate(lines) if line.startswith("   └0 ─"))
+    top = next(i for i, line in enumerate(lines) if line.startswith("100┤"))
+    assert re.fullmatch(r" +└0 ─.*─ 1 000 episodes +└0 ─.*─ 14 min *", lines[axis])
+    assert lines[axis - 1].startswith("  0┤")
+    assert all("│" in line or "┤" in line for line in lines[top:axis])
+    assert axis - top >= (height - 12) * 0.4
+    assert lines[axis - 1].count("┤") == 2
+    if height >= 40:
+        assert " 75┤" in "\n".join(lines)
+        assert "─ 500 ─ 1 000 episodes" in re.sub("─+", "─", lines[axis])
+
+
+@pytest.mark.parametrize(
+    ("episodes", "axis"),
+    [(795, "─ 400 ─ 795 episodes"), (12_345, "─ 6 000 ─ 12 345 episodes"), (0, "─ 50 ─ 100 ep")],
+)
+def test_the_axis_names_round_numbers(episodes: int, axis: str) -> None:
+    state = RunState(CONFIG)
+    state.episodes = episodes
+    text = "\n".join(rendered(state, 120, 40, 30.0))
+    assert axis in re.sub("─+", "─", text)
+    assert re.search(r"└0 ─+ 1 min", text)
+
+
+def test_what_people_and_peers_name_keeps_to_its_place() -> None:
+    """Wide characters, long names, control characters, numbers that are none."""
+    state = busy_state(30)
+    lost = {"loss": math.nan, "mean_q": math.inf, "learner_steps": 2_475.0}
+    state.observe_stats(Stats("learner", "0", lost), 12.0)
+    state.observe_log("actor-1: \x1b[2J\x1b]0;owned\x07 done\r\n日本語 " + 400 * "x")
+    folder = "/home/日本語/" + 100 * "ü" + "/\x1b[31m" + 64 * "n"
+    for width, height in SIZES:
+        lines = rendered(state, width, height, 12.0, folder)
+        assert len(lines) == height
+        assert max(map(cell_len, lines)) <= width
+        text = "\n".join(lines)
+        assert "\x1b" not in text
+        assert "\x07" not in text
+        assert "loss nan · Q inf" in text
+        assert "0:19:48 left" in lines[0]
+        assert lines[-1].rstrip().endswith(KEYS)
+
+
+def test_colours_are_not_needed() -> None:
+    shown = []
+    for colour in (None, "truecolor"):
+        console = Console(
+            width=100, height=32, file=io.StringIO(), record=True, force_terminal=True,
+            color_system=colour, no_color=colour is None,
+        )  # fmt: skip
+        console.print(Screen(busy_state(3), 11.2, Path("runs/quick-1"), KEYS))
+        shown.append(console.export_text(styles=False))
+    assert shown[0] == shown[1]
 
 
 def test_a_silent_service_is_shown_as_such() -> None:
@@ -121,16 +195,25 @@ def test_plain_line_before_anything_is_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "points", "expected"),
-    [([], 3, []), ([5], 3, [5, 5, 5]), ([0, 2], 3, [0, 1, 2]), ([0, 2, 4, 6], 2, [1, 5])],
+    ("points", "num", "expected"),
+    [
+        ([], 3, [None, None, None]),
+        ([(2, 5)], 3, [None, 5, None]),
+        ([(0, 0), (4, 2)], 3, [0, 1, 2]),
+        ([(0, 0), (1, 2), (3, 4), (4, 6)], 2, [1, 5]),
+        ([(0, math.nan), (2, 5), (4, math.inf)], 3, [None, 5, None]),
+    ],
 )
-def test_resample(values: list[float], points: int, expected: list[float]) -> None:
-    assert resample(values, points) == pytest.approx(expected)
+def test_resample(
+    points: list[tuple[float, float]], num: int, expected: list[float | None]
+) -> None:
+    assert resample(points, 4, num) == expected
 
 
 def test_braille_curve_runs_from_the_bottom_to_the_top() -> None:
-    assert braille_curve([0, 100], 1, 1, 0, 100) == ["⡸"]
-    lines = braille_curve([0] * 10 + [100] * 10, 10, 3, 0, 100)
+    assert braille_curve([(0, 0), (1, 100)], 1, 1, 1) == ["⡸"]
+    steps = [(x, 100.0 * (x >= 10)) for x in range(20)]
+    lines = braille_curve(steps, 19, 10, 3)
     assert [len(line) for line in lines] == [10] * 3
-    assert lines[0].startswith("⠀⠀")
+    assert lines[0].startswith("  ")
     assert lines[2].startswith("⣀⣀")

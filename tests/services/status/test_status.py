@@ -46,6 +46,7 @@ def test_status_of_a_silent_service() -> None:
         "alive": True,
         "silent_s": 7.0,
         "slot": 3,
+        "compiling": False,
         "versions": {"zenoh": "1.10.2"},
     }
     assert (replay["alive"], replay["silent_s"], replay["slot"]) == (True, None, None)
