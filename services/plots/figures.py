@@ -1,7 +1,7 @@
 """Figures of a finished or running run: its training curve, and robots' paths in the arena.
 
 Invariants: plotted with matplotlib's Figure on Agg, without global state; an empty run gives an
-empty but labelled figure.
+empty but labelled figure; no label reaches beyond its figure.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,6 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
 
@@ -30,7 +32,8 @@ from mrcdrl.services.monitor.records import (
     read_evaluations,
 )
 
-DPI = 130
+DPI = 200  # of a .png; an .svg has none
+START, WALL, TARGET, OBSTACLE, ROBOT = "red", "#d03030", "#2050d0", "#30a030", "#123c73"
 LIGHT_BLUE, DARK_BLUE, GREEN = "#a9cbe8", "#123c73", "#2a7f3f"
 # One hue for each robot: light at the start, dark at the end.
 ROBOT_HUES = (
@@ -57,8 +60,8 @@ class Path2D:
     outcome: Outcome
 
 
-def training_curve(run_dir: Path, out: Path) -> None:
-    """Plot the training curve of a run to `out` (paper Fig. 6, and its evaluations).
+def training_curve(run_dir: Path, *outs: Path) -> None:
+    """Plot the training curve of a run to `outs` (paper Fig. 6, and its evaluations).
 
     (a) mean score of episodes; (b) successes per 100 episodes with their running maxima; (c)
     evaluation success with its 95 % interval.
@@ -66,15 +69,23 @@ def training_curve(run_dir: Path, out: Path) -> None:
     Raises RunDirectoryError for records of another version.
     """
     episodes, tests = read_episodes(run_dir), read_evaluations(run_dir)
-    figure = Figure(figsize=(9, 11), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(9, 11)
     score, successes, evaluation = figure.subplots(3, 1)
     group = SUCCESS_WINDOW * (10 if len(episodes) >= 40 * SUCCESS_WINDOW else 1)
     _draw_scores(score, episodes, group)
     _draw_successes(successes, episodes, group)
     _draw_evaluations(evaluation, tests)
-    figure.suptitle(run_dir.name, fontsize=13, fontweight="bold")
-    save(figure, out)
+    figure.suptitle(run_dir.name, fontsize=12, fontweight="bold")
+    save(figure, *outs)
+
+
+def blank(width: float, height: float) -> Figure:
+    """An empty figure; sizes in inches."""
+    figure = Figure(
+        figsize=(width, height), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+    )
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def _draw_scores(axes: Axes, episodes: Sequence[EpisodeRecord], group: int) -> None:
@@ -150,7 +161,7 @@ def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
         best = int(np.argmax(rates))
         axes.annotate(
             f"{rates[best]:.1f} %", (steps[best], rates[best]), (0, 7),
-            textcoords="offset points", ha="center", fontweight="bold",
+            textcoords="offset points", ha="center" if best else "left", fontweight="bold",
         )  # fmt: skip
         axes.legend(loc="lower right", frameon=False)
     last = max(10.0, steps.max(initial=0))
@@ -208,30 +219,80 @@ def _interpolation(x: Float64Array, y: Float64Array) -> Callable[[Any], Any]:
     return at
 
 
-def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, out: Path) -> None:
-    """Plot a grid of episodes to `out` (paper Fig. 8).
+def trajectories(episodes: Sequence[Path2D], config: ArenaConfig, *outs: Path) -> None:
+    """Plot a grid of episodes to `outs` (paper Fig. 8).
 
-    Each robot's path is shaded from light (start) to dark (end) in its own hue. Red circles are
-    starts, blue squares targets, red lines walls, green discs obstacles.
+    Each robot's path is shaded from light (start) to dark (end) in its own hue.
     """
     columns = min(4, max(1, len(episodes)))
     rows = max(1, -(-len(episodes) // columns))
-    figure = Figure(figsize=(3.1 * columns, 3.35 * rows), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(3.1 * columns, 3.35 * rows)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
     for axes, episode in zip(grid.flat, episodes, strict=False):
         draw_paths(axes, episode, config)
-    save(figure, out)
+    explain_paths(figure, episodes)
+    save(figure, *outs)
 
 
-def save(figure: Figure, out: Path) -> None:
-    """Write the figure in the format of the suffix; raise MrcdrlError if that fails."""
-    try:
-        figure.savefig(out)
-    except OSError as error:
-        raise MrcdrlError(f"figure {out} cannot be written: {reason(error)}") from error
+def explain_paths(figure: Figure, episodes: Sequence[Path2D]) -> None:
+    """Add a legend of all that `draw_paths` draws."""
+    if not episodes:
+        return
+    handles = [
+        _disc("start", "none", START),
+        Line2D([], [], color=ROBOT, lw=3, label="path"),
+        _disc("end", ROBOT, ROBOT, alpha=0.35),
+        _square("target", TARGET),
+        Line2D([], [], color=WALL, lw=1.3, label="wall"),
+    ]
+    if any(len(episode.obstacles) for episode in episodes):
+        handles.append(_disc("obstacle", OBSTACLE, OBSTACLE))
+    explain(figure, handles)
+
+
+def explain_arena(figure: Figure, *, obstacles: bool) -> None:
+    """Add a legend of what the arena's own image shows."""
+    handles = [
+        _disc("robot", "white", "black"),
+        _square("target", "blue"),
+        Line2D([], [], color="red", lw=1.3, label="wall"),
+    ]
+    explain(figure, [*handles, *([_disc("obstacle", "lime", "lime")] if obstacles else [])])
+
+
+def explain(figure: Figure, handles: Sequence[Line2D]) -> None:
+    """Add a legend below the panels, in as many columns as the figure is wide."""
+    columns = min(len(handles), max(1, int(figure.get_figwidth() / 0.9)))
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=columns,
+        frameon=False,
+        fontsize=9,
+        columnspacing=1.2,
+        handletextpad=0.5,
+    )
+
+
+def _disc(label: str, face: str, edge: str, alpha: float = 1.0) -> Line2D:
+    return Line2D(
+        [], [], ls="", marker="o", ms=9, mfc=face, mec=edge, mew=1.4, alpha=alpha, label=label
+    )
+
+
+def _square(label: str, face: str) -> Line2D:
+    return Line2D([], [], ls="", marker="s", ms=8, mfc=face, mec=face, label=label)
+
+
+def save(figure: Figure, *outs: Path) -> None:
+    """Write the figure to each path in the format of its suffix; MrcdrlError if that fails."""
+    for out in outs:
+        try:
+            figure.savefig(out)
+        except OSError as error:
+            raise MrcdrlError(f"figure {out} cannot be written: {reason(error)}") from error
 
 
 def check_suffix(path: Path, suffixes: Sequence[str]) -> None:
@@ -254,7 +315,7 @@ def draw_paths(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
         lines = LineCollection(list(pieces), cmap=shades, lw=3, capstyle="round", zorder=2)
         lines.set_array(np.arange(len(pieces)))
         axes.add_collection(lines)
-        axes.add_patch(Circle(path[0], radius, fill=False, ec="red", lw=1.6, zorder=3))
+        axes.add_patch(Circle(path[0], radius, fill=False, ec=START, lw=1.6, zorder=3))
         axes.add_patch(Circle(path[-1], radius, fc=dark, ec=dark, alpha=0.35, lw=1.6, zorder=3))
         heading = episode.robots[-1, k, 2]
         tip = path[-1] + radius * np.array([np.cos(heading), np.sin(heading)])
@@ -267,13 +328,13 @@ def _draw_arena(axes: Axes, episode: Path2D, config: ArenaConfig) -> None:
     middle = config.wall_offset_px + config.wall_thickness_px / 2
     inside = size - 2 * middle
     axes.add_patch(Rectangle((0, 0), size, size, fc="#fafafa", ec="#888888", lw=0.8))
-    axes.add_patch(Rectangle((middle, middle), inside, inside, fill=False, ec="#d03030", lw=1.3))
+    axes.add_patch(Rectangle((middle, middle), inside, inside, fill=False, ec=WALL, lw=1.3))
     for x0, y0, x1, y1 in config.inner_walls_px:
-        axes.plot([x0, x1], [y0, y1], color="#d03030", lw=1.3)
+        axes.plot([x0, x1], [y0, y1], color=WALL, lw=1.3)
     for x, y, radius in episode.obstacles:
-        axes.add_patch(Circle((x, y), radius, fc="#30a030", zorder=1))
+        axes.add_patch(Circle((x, y), radius, fc=OBSTACLE, zorder=1))
     for x, y in episode.targets:
-        axes.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, fc="#2050d0", zorder=1))
+        axes.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, fc=TARGET, zorder=1))
     axes.set_xlim(-5, size + 5)
     axes.set_ylim(size + 5, -5)  # y points down, as in the arena's image
     axes.set_aspect("equal")

@@ -4,7 +4,8 @@ Invariants: frames are uint8 BGR of one size. A film is H.264, which every playe
 which every page shows: half as wide and high, every third frame. Neither is held in memory.
 """
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -25,6 +26,8 @@ BACKGROUND = 24
 CAPTION_PX, LABEL_PX, GAP_PX = 40, 22, 12
 MAX_PANEL_PX = 560  # width for the robots' views
 FONT = "fonts/ttf/DejaVuSans.ttf"
+BRIGHTENED = "robots' images brightened"
+_BRIGHTER = np.rint(255 * np.sqrt(np.arange(256) / 255)).astype(np.uint8)
 
 
 def write_film(path: Path, frames: Iterable[UInt8Array], fps: int) -> int:
@@ -114,8 +117,12 @@ _FORMATS = {
 SUFFIXES = tuple(_FORMATS)
 
 
-def compose_frame(arena_bgr: UInt8Array, views: UInt8Array, caption: str) -> UInt8Array:
-    """One frame: the arena on the left, the robots' views enlarged on the right, a caption below.
+def compose_frame(
+    arena_bgr: UInt8Array, views: UInt8Array, caption: str, note: str = ""
+) -> UInt8Array:
+    """One frame: the arena on the left, the robots' views on the right, caption and note below.
+
+    The views are enlarged and brightened: a target's intensity is 29 of 255, and hard to see.
 
     arena_bgr: uint8 [S, S, 3]. views: uint8 [K, V, V], intensities. Returns uint8 BGR [H, W, 3] of
     even size, equal for equal shapes.
@@ -126,7 +133,12 @@ def compose_frame(arena_bgr: UInt8Array, views: UInt8Array, caption: str) -> UIn
     frame = np.full((height + height % 2, width + width % 2, 3), BACKGROUND, np.uint8)
     frame[:size, : arena_bgr.shape[1]] = arena_bgr
     frame[:size, arena_bgr.shape[1] : width] = panel
-    frame[size : size + CAPTION_PX, :width] = _text(caption, width, CAPTION_PX, 18)
+    below = frame[size : size + CAPTION_PX, :width]
+    below[:] = _text([caption], width, CAPTION_PX, 18)
+    room = width - _length(caption, 18) - 3 * GAP_PX
+    beside = [f"{note} · {BRIGHTENED}", BRIGHTENED] if note else [BRIGHTENED]
+    said = _text(beside, max(0, room), CAPTION_PX, 13, right=True)
+    below[:, width - said.shape[1] :] = said
     return frame
 
 
@@ -142,8 +154,9 @@ def _panel(views: UInt8Array, height: int) -> UInt8Array:
     for k, view in enumerate(views):
         y = top + k // columns * pitch
         x = GAP_PX + k % columns * (large + GAP_PX)
-        panel[y : y + LABEL_PX, x : x + large] = _text(f"robot {k + 1} sees", large, LABEL_PX, 13)
-        enlarged = view.repeat(scale, axis=0).repeat(scale, axis=1)[:, :, None]
+        label = [f"robot {k + 1} sees", f"robot {k + 1}", f"{k + 1}"]
+        panel[y : y + LABEL_PX, x : x + large] = _text(label, large, LABEL_PX, 13)
+        enlarged = _BRIGHTER[view].repeat(scale, axis=0).repeat(scale, axis=1)[:, :, None]
         room = panel[y + LABEL_PX : y + LABEL_PX + large, x : x + large]
         room[:] = enlarged[: room.shape[0]]
     return panel
@@ -167,9 +180,20 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / FONT), size)
 
 
-def _text(text: str, width: int, height: int, size: int) -> UInt8Array:
-    """Light text on the background, vertically centred; uint8 [height, width, 3]."""
+def _length(text: str, size: int) -> int:
+    return math.ceil(_font(size).getlength(text))
+
+
+def _text(
+    texts: Sequence[str], width: int, height: int, size: int, *, right: bool = False
+) -> UInt8Array:
+    """The first text that fits, light on the background, uint8 [height, width, 3]; none if none
+    does."""
     image = Image.new("L", (width, height), BACKGROUND)
-    draw = ImageDraw.Draw(image)
-    draw.text((GAP_PX // 2, height // 2), text, fill=235, font=_font(size), anchor="lm")
+    margin = GAP_PX // 2
+    fitting = [text for text in texts if _length(text, size) + 2 * margin <= width]
+    if fitting:
+        at, anchor = (width - margin, "rm") if right else (margin, "lm")
+        draw = ImageDraw.Draw(image)
+        draw.text((at, height // 2), fitting[0], fill=235, font=_font(size), anchor=anchor)
     return np.repeat(np.asarray(image, dtype=np.uint8)[:, :, None], 3, axis=2)

@@ -6,19 +6,31 @@ Invariants: plotted with matplotlib's Figure on Agg, without global state.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Evaluation, Float64Array, Outcome, UInt8Array
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW, read_episodes, read_evaluations
-from mrcdrl.services.plots.figures import DPI, Path2D, draw_paths, dress, means, save, say
+from mrcdrl.services.plots.figures import (
+    Path2D,
+    blank,
+    draw_paths,
+    dress,
+    explain_arena,
+    explain_paths,
+    means,
+    save,
+    say,
+)
 
 SUFFIXES = (".png", ".svg")
+_ROW_NAME = 32  # characters in a line, beside a panel of 3 inches
+_STYLES = ("-", "--", ":", "-.")
 _COLOURS = ("#123c73", "#c4500a", "#2a7f3f", "#6a3d9a", "#b01050", "#0a7a80", "#8a7400", "#444444")
 
 
@@ -40,12 +52,15 @@ class Contender:
     episodes: Sequence[Path2D]  # from the same starts in every row
 
 
-def arenas(images: Sequence[UInt8Array], titles: Sequence[str], out: Path) -> None:
-    """Plot arenas side by side (Fig. 1); images: BGR [S, S, 3]."""
+def arenas(
+    images: Sequence[UInt8Array], titles: Sequence[str], out: Path, *, obstacles: bool
+) -> None:
+    """Plot arenas side by side (Fig. 1); images: BGR [S, S, 3]; obstacles: whether any has some."""
     figure, panels = _panels(1, len(images), 3.6)
     for axes, image, title in zip(panels[0], images, titles, strict=True):
         axes.imshow(image[..., ::-1])
         axes.set_title(title, fontsize=10)
+    explain_arena(figure, obstacles=obstacles)
     save(figure, out)
 
 
@@ -56,8 +71,7 @@ def sight(seen: Sight, config: ArenaConfig, out: Path) -> None:
     that rectangle resized; (c) the state of every robot, one row each, oldest image first.
     """
     num, stack = seen.states.shape[:2]
-    figure = Figure(figsize=(8.6 + 0.9 * stack, 4.4), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(8.6 + 0.9 * stack, 4.4)
     widths = (4.3, 4.3, max(2, 0.9 * stack))
     left, middle, right = figure.subfigures(1, 3, squeeze=False, width_ratios=widths)[0]
     _show_window(left.subplots(), seen, config)
@@ -80,10 +94,11 @@ def comparison(rows: Sequence[Contender], config: ArenaConfig, out: Path) -> Non
     for row, contender in zip(panels, rows, strict=True):
         for axes, episode in zip(row, contender.episodes, strict=True):
             draw_paths(axes, episode, config)
-        row[0].text(
-            -0.04, 0.5, contender.name, transform=row[0].transAxes,
-            rotation=90, ha="right", va="center", fontweight="bold",
-        )  # fmt: skip
+        row[0].set_axis_on()  # for its label alone
+        row[0].set(xticks=[], yticks=[])
+        row[0].spines[:].set_visible(False)
+        row[0].set_ylabel(fill(contender.name, _ROW_NAME), fontsize=9, fontweight="bold")
+    explain_paths(figure, [episode for row in rows for episode in row.episodes])
     save(figure, out)
 
 
@@ -92,26 +107,27 @@ def curves(run_dirs: Sequence[Path], out: Path) -> None:
 
     Raises RunDirectoryError for records of another version.
     """
-    figure = Figure(figsize=(9, 7.5), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(9, 7.5)
     training, test = figure.subplots(2, 1)
     dress(training, "(a) successes per 100 episodes of training", "episodes", "successes")
     dress(test, "(b) success in the paper's test", "learner steps", "success, %")
     for number, run_dir in enumerate(run_dirs):
         colour = _COLOURS[number % len(_COLOURS)]
+        style = _STYLES[number // len(_COLOURS) % len(_STYLES)]
+        line = {"color": colour, "ls": style, "label": run_dir.name}
         won = [record.episode.outcome is Outcome.SUCCESS for record in read_episodes(run_dir)]
-        training.plot(*means(SUCCESS_WINDOW * np.array(won, float), SUCCESS_WINDOW), color=colour)
+        training.plot(*means(SUCCESS_WINDOW * np.array(won, float), SUCCESS_WINDOW), **line)
         tests = sorted((e.evaluation for e in read_evaluations(run_dir)), key=_learner_step)
         steps = [e.learner_step for e in tests]
-        test.plot(steps, [100 * e.success_rate for e in tests], color=colour, label=run_dir.name)
+        test.plot(steps, [100 * e.success_rate for e in tests], **line)
         bounds = 100 * np.array([e.success_interval for e in tests], float).reshape(-1, 2)
         test.fill_between(steps, *bounds.T, color=colour, alpha=0.15, lw=0)
     for axes in (training, test):
         axes.set_ylim(-2, 102)
-        axes.set_xlim(left=0)
+        axes.set_xlim(0, max(SUCCESS_WINDOW, axes.get_xlim()[1]))
         if not any(len(line.get_xdata()) for line in axes.get_lines()):
             say(axes, "no records")
-    test.legend(loc="lower right", frameon=False)
+        axes.legend(loc="lower right", fontsize=8, framealpha=0.8)
     save(figure, out)
 
 
@@ -140,8 +156,7 @@ def _show_window(axes: Axes, seen: Sight, config: ArenaConfig) -> None:
 
 def _panels(rows: int, columns: int, side: float) -> tuple[Figure, np.ndarray]:
     """A figure and its axes [rows, columns] without frames; side: a panel's, in inches."""
-    figure = Figure(figsize=(side * columns, (side + 0.25) * rows), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(side * columns, (side + 0.25) * rows)
     panels = figure.subplots(rows, columns, squeeze=False)
     for axes in panels.flat:
         axes.set_axis_off()

@@ -41,12 +41,17 @@ def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[
             yield Moment(number, frame, scene, views, ending)
 
 
-def film_frames(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[UInt8Array]:
-    """Yield images uint8 BGR [H, W, 3] of all frames of these episodes, for a film."""
+def film_frames(
+    config: ArenaConfig, episodes: Sequence[EpisodeResult], note: str = ""
+) -> Iterator[UInt8Array]:
+    """Yield images uint8 BGR [H, W, 3] of all frames of these episodes, for a film.
+
+    note: which episodes these are.
+    """
     for number, frame, scene, views, ending in moments(config, episodes):
         caption = f"episode {number} of {len(episodes)}   frame {frame}"
         if ending:
             caption += f"   {ending}"
-        image = compose_frame(render_arena(scene, config, _ARENA_PX), views, caption)
+        image = compose_frame(render_arena(scene, config, _ARENA_PX), views, caption, note)
         for _ in range(_ENDING_FRAMES if ending else 1):
             yield image

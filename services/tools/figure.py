@@ -84,12 +84,14 @@ def _arena(arguments: argparse.Namespace) -> None:
     """Draw a test start in the arena of each subject, or of --config if there is none."""
     named = [shown.config for shown in _subjects(arguments)]
     configs = [config.arena for config in named or [config_without_weights(arguments)]]
-    images = []
+    images, obstacles = [], False
     for config in configs:
         (start,) = test_starts(config, 1, arguments.seed)
+        obstacles |= len(start.obstacles) > 0
         scene = Scene(start.robots, start.targets, start.obstacles)
         images.append(render_arena(scene, config, _ARENA_PX, smooth=True))
-    arenas(images, [f"{config.num_robots} robots" for config in configs], arguments.out)
+    titles = [f"{c.num_robots} robot{'s' * (c.num_robots != 1)}" for c in configs]
+    arenas(images, titles, arguments.out, obstacles=obstacles)
 
 
 def _views(arguments: argparse.Namespace) -> None:

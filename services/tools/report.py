@@ -1,13 +1,13 @@
-"""`mrcdrl report RUN`: write training.png, trajectories.png and evaluation.mp4 of a run."""
+"""`mrcdrl report RUN`: write the plots of a run, as .png and .svg, and evaluation.mp4."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.errors import RunDirectoryError
-from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
 from mrcdrl.services.plots.film import write_film
+from mrcdrl.services.plots.paper import SUFFIXES
 from mrcdrl.services.tools.episode_frames import film_frames
 from mrcdrl.services.tools.render import FPS
 from mrcdrl.services.tools.subject import subject, subject_parser
@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> int:
     run_dir: Path = parser.parse_args(argv).run
     if not run_dir.is_dir():
         raise RunDirectoryError(f"{run_dir} is not a directory")
-    training_curve(run_dir, run_dir / "training.png")
+    training_curve(run_dir, *plots(run_dir, "training"))
     draw_episodes(run_dir)
     return 0
 
@@ -35,10 +35,11 @@ def draw_episodes(run_dir: Path) -> None:
     arena = shown.config.arena
     results = shown.episodes(_EPISODES, _SEED)
     paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]
-    trajectories(paths, arena, run_dir / "trajectories.png")
-    write_film(run_dir / "evaluation.mp4", film_frames(arena, shortest(results)), FPS)
+    trajectories(paths, arena, *plots(run_dir, "trajectories"))
+    note = f"the first {_FILMED} of {_EPISODES} episodes"
+    write_film(run_dir / "evaluation.mp4", film_frames(arena, results[:_FILMED], note), FPS)
 
 
-def shortest(results: Sequence[EpisodeResult]) -> list[EpisodeResult]:
-    """The few shortest episodes, which are the ones to film."""
-    return sorted(results, key=lambda r: r.frames)[:_FILMED]
+def plots(run_dir: Path, name: str) -> list[Path]:
+    """The files of a plot, one in each format."""
+    return [run_dir / f"{name}{suffix}" for suffix in SUFFIXES]

@@ -1,12 +1,15 @@
 """Figures and films from synthetic runs: they are written, readable, and of the right size."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import av
 import numpy as np
 import pytest
-from PIL import Image
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
 
 from mrcdrl.common.config import ArenaConfig, load_config
 from mrcdrl.common.errors import MrcdrlError
@@ -15,6 +18,7 @@ from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
 from mrcdrl.services.plots.film import compose_frame, write_film
+from mrcdrl.services.plots.paper import Contender, arenas, comparison, curves
 
 CONFIG = load_config("quick", environ={})
 
@@ -41,9 +45,11 @@ def test_training_curve_of_any_length(
     tmp_path: Path, num_episodes: int, num_evaluations: int
 ) -> None:
     record(tmp_path, num_episodes, num_evaluations)
-    training_curve(tmp_path, tmp_path / "curve.png")
+    training_curve(tmp_path, tmp_path / "curve.png", tmp_path / "curve.svg")
+    assert ElementTree.parse(tmp_path / "curve.svg").getroot().tag.endswith("svg")
     with Image.open(tmp_path / "curve.png") as image:
-        assert min(image.size) > 1_000
+        assert image.size == (1_800, 2_200)
+        assert image.info["dpi"] == pytest.approx((200, 200), abs=1)
         assert len(np.unique(np.asarray(image.convert("L")))) > 50
 
 
@@ -73,17 +79,130 @@ def test_an_episode_of_one_frame_can_be_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "paths.png").exists()
 
 
+LONG = "n" * 64  # no name of a run is longer
+
+
+def still(*, obstacles: int = 0) -> Path2D:
+    robots, targets = np.full((3, 2, 3), 100.0), np.full((2, 2), 300.0)
+    return Path2D(robots, targets, np.full((obstacles, 3), 200.0), Outcome.COLLISION)
+
+
+def draw_curve(folder: Path, out: Path) -> None:
+    record(folder / LONG, 450, 12)
+    training_curve(folder / LONG, out)
+
+
+def draw_curves(folder: Path, out: Path) -> None:
+    runs = [folder / f"{number}{LONG[1:]}" for number in range(9)]
+    for run in runs:
+        record(run, 200, 3)
+    curves(runs, out)
+
+
+def draw_paths(_: Path, out: Path) -> None:
+    trajectories([still(obstacles=1)], ArenaConfig(), out)
+
+
+def draw_comparison(_: Path, out: Path) -> None:
+    rows = [Contender(f"{LONG}: 12 of 12", [still()] * 2)] * 3
+    comparison(rows, ArenaConfig(), out)
+
+
+def draw_arenas(_: Path, out: Path) -> None:
+    arenas([np.zeros((60, 60, 3), np.uint8)], ["4 robots"], out, obstacles=True)
+
+
+@pytest.mark.parametrize(
+    ("draw", "legends", "words"),
+    [
+        (draw_curve, 3, "95 % interval"),
+        (draw_curves, 2, f"8{LONG[1:]}"),
+        (draw_paths, 1, "obstacle"),
+        (draw_comparison, 1, "target"),
+        (draw_arenas, 1, "obstacle"),
+    ],
+)
+def test_nothing_is_cut_off_and_every_panel_is_explained(
+    draw: Callable[[Path, Path], None],
+    legends: int,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, _out: drawn.append(figure))
+    draw(tmp_path, tmp_path / "figure.png")
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+    assert min(box.x0, box.y0, width - box.x1, height - box.y1) > 0
+    found = [*figure.legends, *(legend for a in figure.axes if (legend := a.get_legend()))]
+    assert len(found) == legends
+    assert words in [text.get_text() for legend in found for text in legend.get_texts()]
+
+
+def test_long_names_of_rows_do_not_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, _out: drawn.append(figure))
+    draw_comparison(tmp_path, tmp_path / "figure.png")
+    drawn[0].draw_without_rendering()
+    names = [axes.yaxis.label for axes in drawn[0].axes[::2]]
+    assert [name.get_text().replace("\n", "") for name in names] == [f"{LONG}: 12 of 12"] * 3
+    boxes = [name.get_window_extent() for name in names]
+    assert all(upper.y0 > lower.y1 for upper, lower in itertools.pairwise(boxes))
+
+
 @pytest.mark.parametrize("num_robots", [1, 2, 3, 4, 10])
 def test_composed_frames_hold_arena_views_and_caption(num_robots: int) -> None:
     arena = np.full((600, 600, 3), (10, 120, 200), np.uint8)
     views = np.full((num_robots, 60, 60), 199, np.uint8)
-    frame = compose_frame(arena, views, "episode 1 · ε 0.01")
+    frame = compose_frame(arena, views, "episode 1 · ε 0.01", "the first 4 of 12 episodes")
     assert frame.dtype == np.uint8
     assert [side % 2 for side in frame.shape[:2]] == [0, 0]
     assert (frame[:600, :600] == arena).all()
-    enlarged = (frame[:600, 600:] == 199).all(axis=2).sum()
+    enlarged = (frame[:600, 600:] == 225).all(axis=2).sum()
     assert enlarged >= num_robots * 60 * 60 * (16 if num_robots <= 4 else 4) * 0.99
-    assert (frame[600:] > 200).any()
+    assert (frame[600:, :300] > 200).any()
+    assert (frame[600:, -200:] > 200).any()
+
+
+def test_targets_and_walls_can_be_seen_in_the_robots_images() -> None:
+    """Intensities 29 and 76, on a ground of 0, as robots and obstacles are."""
+    views = np.zeros((1, 60, 60), np.uint8)
+    for column, intensity in enumerate((29, 76, 150, 255)):
+        views[:, :, 10 * (column + 1)] = intensity
+    frame = compose_frame(np.zeros((600, 600, 3), np.uint8), views, "")
+    shown = np.unique(frame[300, 650:])
+    assert set(shown) >= {0, 86, 139, 196, 255}
+
+
+def texts_of_a_frame(monkeypatch: pytest.MonkeyPatch, num_robots: int, note: str) -> list[str]:
+    written: list[str] = []
+    text = ImageDraw.ImageDraw.text
+
+    def write(self: ImageDraw.ImageDraw, at: object, words: str, **options: object) -> None:
+        written.append(words)
+        text(self, at, words, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", write)
+    views = np.zeros((num_robots, 60, 60), np.uint8)
+    compose_frame(np.zeros((600, 600, 3), np.uint8), views, "episode 1 of 4   frame 300", note)
+    return written
+
+
+def test_a_frame_says_that_images_are_brightened_and_which_episodes_are_shown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written = texts_of_a_frame(monkeypatch, 2, "the first 4 of 12 episodes")
+    assert written[:2] == ["robot 1 sees", "robot 2 sees"]
+    assert written[-1] == "the first 4 of 12 episodes · robots' images brightened"
+    assert texts_of_a_frame(monkeypatch, 2, "")[-1] == "robots' images brightened"
+
+
+def test_labels_that_do_not_fit_are_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = texts_of_a_frame(monkeypatch, 20, "")
+    assert "robot 1" in written
+    assert "20" in written
 
 
 def counting_frames(num: int, height: int, width: int) -> Iterator[UInt8Array]:
