@@ -63,8 +63,8 @@ the file, which beats the default below:
   lockstep (`run.turn_size`) it also keeps {kept_in_lockstep}. All others may change.
 
 *Source* says where a default comes from: *paper* (the publication, docs/paper.md), *ancestor* (the
-pymunk car game that the paper's environment descends from), *Ape-X* or *dueling paper* (those
-publications), *ours*.
+pymunk car game that the paper's environment descends from), *Ape-X*, *dueling paper*
+and *Munchausen paper* (those publications), *ours*.
 """
 
 

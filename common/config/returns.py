@@ -1,24 +1,37 @@
 """The most that an arena's rewards may come to: a bound on what is predicted and what is sent."""
 
-from mrcdrl.common.config.schema import ArenaConfig, Config
+import math
+
+from mrcdrl.common.config.schema import AgentConfig, Config
 
 _ON_TARGET = 1.0  # the most that a frame on a target brings, whatever arena.proximity_weight
 _COUNTED = 24.0  # the most that a frame of the counting arena brings
+_LARGEST_ENTROPY = math.log(3)  # of a policy over three actions
 
 
 def largest_return(config: Config) -> float:
     """A bound on the value of any state, in scaled rewards: all that an episode may bring."""
-    frames = min(config.arena.max_frames, 1 / (1 - config.agent.gamma))
-    return config.agent.reward_scale * _sum_of_rewards(config.arena, frames)
+    agent = config.agent
+    frames = min(config.arena.max_frames, 1 / (1 - agent.gamma))
+    return agent.reward_scale * _sum_of_rewards(config, frames) + frames * _log_policy(agent)
 
 
 def largest_n_step_return(config: Config) -> float:
-    """A bound on a transition's n-step return, in rewards as the arena gives them."""
-    return _sum_of_rewards(config.arena, config.agent.n_step)
+    """A bound on a transition's n-step return, in rewards as actors send them."""
+    return _sum_of_rewards(config, config.agent.n_step)
 
 
-def _sum_of_rewards(arena: ArenaConfig, frames: float) -> float:
+def _sum_of_rewards(config: Config, frames: float) -> float:
     """A bound on the absolute sum of a robot's rewards over so many frames of an episode."""
+    arena = config.arena
     usual = _COUNTED if arena.kind == "counting" else max(abs(arena.step_reward), _ON_TARGET)
     collisions = min(arena.max_collisions, frames)
     return abs(arena.success_reward) + collisions * abs(arena.collision_reward) + frames * usual
+
+
+def _log_policy(agent: AgentConfig) -> float:
+    """A bound on what the log-policy adds to a frame, in scaled rewards."""
+    if not agent.munchausen_alpha:
+        return 0.0
+    entropy = agent.munchausen_temperature * _LARGEST_ENTROPY
+    return agent.munchausen_alpha * agent.munchausen_clip + entropy

@@ -4,7 +4,7 @@ A default is the paper's where the paper gives one ("paper"), that of the game i
 where that settles it ("ancestor"), and ours otherwise ("ours").
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self, cast
 
@@ -21,6 +21,7 @@ Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, le=LARGEST)]
 Seconds = Annotated[float, Field(gt=0, le=_LONGEST_S)]
 Pause = Annotated[float, Field(ge=0, le=_LONGEST_S)]  # in seconds
+Schedule = tuple[tuple[int, float], ...]  # points (learner step, value)
 Reward = Annotated[float, Field(ge=-1e6, le=1e6)]  # sums of them are exact enough in float32
 
 
@@ -202,11 +203,20 @@ class AgentConfig(Section):
     """Factor on the rewards in the learner's target. (ours)"""
     loss: Literal["squared", "huber"] = "squared"
     """Loss of the TD error, Eq. (3). (paper: squared)"""
+    munchausen_alpha: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Part of the action's log-probability that is added to the target, by the target network's
+    softmax policy, which also makes the bootstrap soft; 0: none. (ours; Munchausen paper: 0.9)"""
+    munchausen_temperature: Annotated[float, Field(ge=0)] = 0.03
+    """Temperature of that policy, in scaled rewards; 0 is advantage learning: the part is of
+    Q(s, a) - max Q(s, .), and the bootstrap stays hard. (Munchausen paper)"""
+    munchausen_clip: Positive = 1.0
+    """Temperature times log-probability, or the advantage, counts as no less than minus this, in
+    scaled rewards. (Munchausen paper; advantage learning: never)"""
     optimizer: Annotated[Literal["adam", "rmsprop"], Kept()] = "adam"
     """(ours; ancestor: rmsprop)"""
     learning_rate: Positive = 1e-4
     """(ours)"""
-    learning_rate_schedule: tuple[tuple[int, float], ...] = ((0, 1.0),)
+    learning_rate_schedule: Schedule = ((0, 1.0),)
     """Points (learner step, factor of learning_rate), linear between, constant after the last.
     (ours)"""
     optimizer_epsilon: Positive = 1e-7
@@ -224,7 +234,7 @@ class AgentConfig(Section):
         return self
 
 
-def _check_schedule(name: str, points: Sequence[tuple[int, float]]) -> None:
+def _check_schedule(name: str, points: Schedule) -> None:
     steps = [step for step, _ in points]
     if not steps or steps[0] != 0 or steps != sorted(set(steps)):
         raise ValueError(f"{name} needs points whose steps rise from 0")
@@ -236,7 +246,7 @@ class ExplorationConfig(Section):
     kind: Literal["schedule", "ladder"] = "schedule"
     """`schedule`: epsilon over learner steps, the same in every actor. `ladder`: the schedule,
     raised to powers from 1 to ladder_power spread over the arenas of all actors. (ours; Ape-X)"""
-    schedule: tuple[tuple[int, float], ...] = ((0, 1.0), (800_000, 0.1))
+    schedule: Schedule = ((0, 1.0), (800_000, 0.1))
     """Points (learner step, epsilon), linear between, constant after the last. (paper)"""
     ladder_power: Annotated[float, Field(ge=1)] = 3.0
     """Power of the arena that explores least. (ours; Ape-X: 8 with 360 actors)"""

@@ -1,5 +1,7 @@
 """The update on one screen: the loss of a TD error (paper section 4, Eqs. (2) to (4)).
 
+Two targets that are not the paper's are options: Munchausen DQN and advantage learning.
+
 `td_loss` is a pure function of two action-value functions and a batch. Every learner step computes
 it: `PlainStep` with the networks themselves, `accelerate/` with faster ways to evaluate and
 differentiate the same functions.
@@ -38,18 +40,23 @@ def td_loss(
 ) -> TDLoss:
     """Loss and TD errors of a batch; online, target: states to values float32 [B, A].
 
-    A discount of 0 leaves the reward alone, whatever the values of the next state are. Only the
+    A discount of 0 leaves the bootstrap out, whatever the values of the next state are. Only the
     values of the actions taken have a gradient.
     """
     with torch.no_grad():
         next_q = target(batch.next_observation)
-        # dqn, Eq. (4): the target network picks the action whose value it gives. ddqn and duel,
-        # Eq. (2): the online network picks it.
-        chooses = next_q if agent.kind == "dqn" else online(batch.next_observation)
-        next_value = next_q.gather(1, chooses.argmax(dim=1, keepdim=True)).squeeze(1)
+        if agent.munchausen_alpha and agent.munchausen_temperature:
+            next_value = _soft_maximum(next_q, agent.munchausen_temperature)
+        else:
+            # dqn, Eq. (4): the target network picks the action whose value it gives. ddqn and
+            # duel, Eq. (2): the online network picks it.
+            chooses = next_q if agent.kind == "dqn" else online(batch.next_observation)
+            next_value = next_q.gather(1, chooses.argmax(dim=1, keepdim=True)).squeeze(1)
         y = agent.reward_scale * batch.reward + batch.discount * next_value
+        if agent.munchausen_alpha:
+            y = y + _log_policy_term(target(batch.observation), batch.action, agent)
     q = online(batch.observation)
-    taken = q.gather(1, batch.action.unsqueeze(1)).squeeze(1)
+    taken = _values_of(batch.action, q)
     if agent.loss == "squared":  # Eq. (3)
         losses = functional.mse_loss(taken, y, reduction="none")
     else:  # half the square up to an error of 1, then linear
@@ -57,3 +64,27 @@ def td_loss(
     loss = torch.mean(batch.importance_weights * losses)
     q = q.detach()
     return TDLoss(loss, td_errors=y - taken.detach(), greedy_q=q.max(dim=1).values)
+
+
+def _log_policy_term(q: Tensor, action: Tensor, agent: AgentConfig) -> Tensor:
+    """What is added to the target for actions [B] in states with target values q [B, A]; <= 0.
+
+    Munchausen DQN (Vieillard et al. 2020): alpha tau log pi(a|s), where tau log pi counts as minus
+    the clip if it is below that. With tau -> 0 it is Q(s, a) - max Q(s, .), advantage learning
+    (Bellemare et al. 2016). As in the authors' code, an n-step return has the term of its first
+    action alone.
+    """
+    log_policy = _values_of(action, q) - _soft_maximum(q, agent.munchausen_temperature)
+    return agent.munchausen_alpha * log_policy.clamp(-agent.munchausen_clip, 0.0)
+
+
+def _soft_maximum(q: Tensor, temperature: float) -> Tensor:
+    """sum_a pi(a) (q(a) - tau log pi(a)) [B], with pi = softmax(q / tau); at 0 the maximum."""
+    if not temperature:
+        return q.max(dim=1).values
+    return temperature * torch.logsumexp(q / temperature, dim=1)
+
+
+def _values_of(action: Tensor, q: Tensor) -> Tensor:
+    """The values [B] of these actions [B], of q [B, A]."""
+    return q.gather(1, action.unsqueeze(1)).squeeze(1)

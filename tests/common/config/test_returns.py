@@ -23,6 +23,15 @@ def test_the_largest_n_step_return_is_that_of_n_frames_and_not_scaled() -> None:
     assert largest_n_step_return(config) == 100 + 2 * 2 + 2 * 1
 
 
+def test_a_log_policy_widens_the_bound_on_values_alone() -> None:
+    plain = load_config(None, REWARDS, environ={})
+    more = {"agent.munchausen_alpha": "0.5", "agent.munchausen_temperature": "0.1"}
+    config = load_config(None, REWARDS | more, environ={})
+    added = largest_return(config) - largest_return(plain)
+    assert added == pytest.approx(10 * (0.5 * 1.0 + 0.1 * np.log(3)))
+    assert largest_n_step_return(config) == largest_n_step_return(plain)
+
+
 @pytest.mark.parametrize("reward", ["0", "200"])
 def test_no_arena_gives_more(reward: str) -> None:
     given = {"arena.success_reward": reward, "arena.collision_reward": "0", "agent.n_step": "3"}

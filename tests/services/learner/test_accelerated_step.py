@@ -1,6 +1,7 @@
 """The accelerated step is held to the plain one, and gives the same bits every time."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import pytest
@@ -10,6 +11,7 @@ from torch import Tensor
 from mrcdrl.common.config import AgentConfig
 from mrcdrl.common.model.q_network import Kind, QNetwork
 from mrcdrl.services.learner.accelerate.step import AcceleratedStep
+from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.step import GradientStep, PlainStep
 from tests.services.learner.test_cuda_graphs import assert_same, batches, make_learner
@@ -26,12 +28,20 @@ def networks(kind: Kind) -> tuple[QNetwork, QNetwork]:
     return pair[0], pair[1].requires_grad_(requires_grad=False)
 
 
-def moved(step: GradientStep, online: QNetwork) -> list[dict[str, Tensor]]:
+def moved(step: GradientStep, online: QNetwork, given: Sequence[Batch]) -> list[dict[str, Tensor]]:
     """What each of a few updates tells, and how far all of them moved the parameters."""
     before = {name: p.detach().clone() for name, p in online.named_parameters()}
-    told = [dataclasses.asdict(step([batch], [RATE])[0]) for batch in batches(4)]
+    told = [dataclasses.asdict(step([batch], [RATE])[0]) for batch in given]
     parameters = online.named_parameters()
     return [*told, {name: p.detach() - before[name] for name, p in parameters}]
+
+
+def assert_near(found: list[dict[str, Tensor]], expected: list[dict[str, Tensor]]) -> None:
+    """Within 1e-4 of the largest number of each kind: sums are added in another order."""
+    for one, other in zip(expected, found, strict=True):
+        for name, due in one.items():
+            bound = 1e-4 * float(due.abs().max()) + 1e-7
+            torch.testing.assert_close(other[name], due, atol=bound, rtol=0.0, msg=name)
 
 
 @pytest.mark.parametrize("kind", ["duel", "ddqn", "dqn"])
@@ -44,19 +54,49 @@ def test_it_does_what_the_plain_step_does(
     optimizer: Literal["adam", "rmsprop"],
     threads: int,
 ) -> None:
-    """Within 1e-4 of the largest number of each kind: sums are added in another order.
-
-    The optimizers divide by the gradient's size; with this epsilon a rounded zero stays small.
-    """
+    """With this epsilon a rounded zero stays small when an optimizer divides by its size."""
     agent = AgentConfig(kind=kind, loss=loss, optimizer=optimizer, optimizer_epsilon=1e-2)
     online, target = networks(kind)
-    expected = moved(PlainStep(online, target, agent), online)
+    expected = moved(PlainStep(online, target, agent), online, batches(4))
     online, target = networks(kind)
-    found = moved(AcceleratedStep(online, target, agent, num_threads=threads), online)
-    for one, other in zip(expected, found, strict=True):
-        for name, due in one.items():
-            bound = 1e-4 * float(due.abs().max()) + 1e-7
-            torch.testing.assert_close(other[name], due, atol=bound, rtol=0.0, msg=name)
+    step = AcceleratedStep(online, target, agent, num_threads=threads)
+    assert_near(moved(step, online, batches(4)), expected)
+
+
+@pytest.mark.parametrize("temperature", [0.0, 0.03])
+@pytest.mark.parametrize("nonzero", [1.0, 0.05])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_munchausen_does_what_it_does_in_the_plain_step(
+    temperature: float, nonzero: float, threads: int
+) -> None:
+    """Also on images that are mostly black, which take the sparse first layer."""
+    agent = AgentConfig(
+        munchausen_alpha=0.9, munchausen_temperature=temperature, optimizer_epsilon=1e-2
+    )
+    given = [darkened(batch, nonzero) for batch in batches(4)]
+    online, target = networks("duel")
+    expected = moved(PlainStep(online, target, agent), online, given)
+    online, target = networks("duel")
+    found = moved(AcceleratedStep(online, target, agent, num_threads=threads), online, given)
+    assert_near(found, expected)
+    online, target = networks("duel")
+    without = moved(PlainStep(online, target, AgentConfig()), online, given)
+    with pytest.raises(AssertionError):  # else the term is lost on both sides
+        assert_near(without, expected)
+
+
+def darkened(batch: Batch, nonzero: float) -> Batch:
+    """The batch with some of its images' pixels left, the others black."""
+    generator = torch.Generator().manual_seed(0)
+
+    def left(images: Tensor) -> Tensor:
+        return images * (torch.rand(images.shape, generator=generator) < nonzero)
+
+    return dataclasses.replace(
+        batch,
+        observation=left(batch.observation),
+        next_observation=left(batch.next_observation),
+    )
 
 
 def test_both_keep_the_same_moments() -> None:

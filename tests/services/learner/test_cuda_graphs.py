@@ -89,18 +89,28 @@ def assert_same(one: Update, other: Update) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "optimizer"),
-    [("duel", "adam"), ("ddqn", "adam"), ("dqn", "adam"), ("duel", "rmsprop")],
+    ("kind", "optimizer", "munchausen_alpha"),
+    [
+        ("duel", "adam", 0.0),
+        ("ddqn", "adam", 0.0),
+        ("dqn", "adam", 0.0),
+        ("duel", "rmsprop", 0.0),
+        ("duel", "adam", 0.9),
+    ],
 )
 @pytest.mark.parametrize("launch", [1, 3])
 def test_a_captured_step_is_the_eager_one_bit_for_bit(
-    kind: Literal["duel", "ddqn", "dqn"], optimizer: Literal["adam", "rmsprop"], launch: int
+    kind: Literal["duel", "ddqn", "dqn"],
+    optimizer: Literal["adam", "rmsprop"],
+    munchausen_alpha: float,
+    launch: int,
 ) -> None:
     """Over copies to the target network and a learning rate that falls."""
     agent = AgentConfig(
         kind=kind,
         optimizer=optimizer,
         optimizer_epsilon=1e-5,
+        munchausen_alpha=munchausen_alpha,
         target_period=4,
         learning_rate_schedule=((0, 1.0), (6, 1.0), (8, 0.01)),
     )
