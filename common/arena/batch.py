@@ -21,6 +21,7 @@ from mrcdrl.common.arena.world.starts import training_start
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import (
     BoolArray,
+    Float64Array,
     Int64Array,
     Outcome,
     StepType,
@@ -119,6 +120,16 @@ class ArenaBatch:
             hit_wall=hit_wall,
             outcomes=outcomes,
         )
+
+    def assigned_distances_px(self, arenas: Int64Array) -> Float64Array:
+        """Distances [N, K] of robots to their targets in these arenas, assigned anew each time.
+
+        Targets are distinct, and the sum is the least. A robot that has failed needs none: 0.
+        """
+        # Imported here because scipy takes long to load, and few runs need it.
+        from mrcdrl.common.arena.controllers.heading import assigned_distances_px
+
+        return assigned_distances_px(self._scenes(arenas), ~self.failed[arenas])
 
     def _fail(self, arenas: Int64Array) -> None:
         """Draws which robots fail in this frame; the last working robot never does."""

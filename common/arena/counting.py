@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from mrcdrl.common.arena.world.scene import Scene, Start, checked_actions
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import (
+    Float64Array,
     Int64Array,
     Outcome,
     StepType,
@@ -126,6 +127,7 @@ class CountingBatch:
 
     def __init__(self, config: ArenaConfig, identities: Sequence[int]) -> None:
         """identities: one per arena."""
+        self._num_robots = config.num_robots
         self._arenas = [CountingArena(config, identity=identity) for identity in identities]
 
     def __len__(self) -> int:
@@ -146,6 +148,10 @@ class CountingBatch:
             hit_wall=np.stack([step.hit_wall for step in steps]),
             outcomes=tuple(step.outcome for step in steps),
         )
+
+    def assigned_distances_px(self, arenas: Int64Array) -> Float64Array:
+        """Zeros [N, K]: robots and targets stay at the origin."""
+        return np.zeros((len(arenas), self._num_robots))
 
 
 def decode_counters(images: UInt8Array) -> Counters:

@@ -23,10 +23,14 @@ def largest_n_step_return(config: Config) -> float:
 
 def _sum_of_rewards(config: Config, frames: float) -> float:
     """A bound on the absolute sum of a robot's rewards over so many frames of an episode."""
-    arena = config.arena
+    arena, agent = config.arena, config.agent
     usual = _COUNTED if arena.kind == "counting" else max(abs(arena.step_reward), _ON_TARGET)
     collisions = min(arena.max_collisions, frames)
-    return abs(arena.success_reward) + collisions * abs(arena.collision_reward) + frames * usual
+    price = abs(arena.collision_reward) * max(factor for _, factor in agent.collision_schedule)
+    farthest_px = math.sqrt(2) * arena.size_px
+    # Shaping adds up to the difference of two potentials of one sign, however many the frames.
+    potential = agent.shaping_per_px * farthest_px
+    return abs(arena.success_reward) + collisions * price + frames * usual + potential
 
 
 def _log_policy(agent: AgentConfig) -> float:

@@ -199,6 +199,16 @@ class AgentConfig(Section):
     """(paper)"""
     n_step: Annotated[int, Field(ge=1, le=32), Kept()] = 1
     """Rewards summed before the bootstrap. (paper: 1; Ape-X: 3)"""
+    shaping_per_px: Annotated[float, Field(ge=0, le=1000), Kept()] = 0.0
+    """Potential that a robot loses with each px between it and its target, by the assignment with
+    the least sum of distances. Learned from are then rewards with gamma Phi(s') - Phi(s) added;
+    scores and the test never see it. 0: none. (ours; Ng et al. 1999)"""
+    shaping_schedule: Annotated[Schedule, Kept()] = ((0, 1.0),)
+    """Points (learner step of the weights that act, factor 0 to 1 of shaping_per_px), linear
+    between, constant after the last. (ours; Devlin and Kudenko 2012)"""
+    collision_schedule: Annotated[Schedule, Kept()] = ((0, 1.0),)
+    """Points (learner step of the weights that act, factor 0 to 100 of arena.collision_reward in
+    the rewards learned from), linear between, constant after the last. (ours)"""
     reward_scale: Annotated[Positive, Kept()] = 1.0
     """Factor on the rewards in the learner's target. (ours)"""
     loss: Literal["squared", "huber"] = "squared"
@@ -231,6 +241,11 @@ class AgentConfig(Section):
         _check_schedule("learning_rate_schedule", self.learning_rate_schedule)
         if any(factor <= 0 for _, factor in self.learning_rate_schedule):
             raise ValueError("learning_rate_schedule has a factor that is not above 0")
+        for name, most in (("shaping_schedule", 1), ("collision_schedule", 100)):
+            points = getattr(self, name)
+            _check_schedule(name, points)
+            if any(not 0 <= factor <= most for _, factor in points):
+                raise ValueError(f"{name} has a factor outside 0 ... {most}")
         return self
 
 

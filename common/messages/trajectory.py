@@ -80,19 +80,27 @@ class TimeSteps:
     def __iter__(self) -> Iterator[TimeStep]:
         return (self[arena] for arena in range(len(self.outcomes)))
 
+    @property
+    def terminated(self) -> BoolArray:
+        """The arenas [A] whose episodes ended, and not by the time limit."""
+        return np.array([_terminates(outcome) for outcome in self.outcomes])
+
     def __getitem__(self, arena: int) -> TimeStep:
         """The time step of one arena."""
         outcome = self.outcomes[arena]
-        terminated = outcome is not None and outcome is not Outcome.TIMEOUT
         return TimeStep(
             step_type=StepType.MID if outcome is None else StepType.LAST,
             records=self.records[arena],
             rewards=self.rewards[arena],
-            discount=0.0 if terminated else 1.0,
+            discount=0.0 if _terminates(outcome) else 1.0,
             collided=self.collided[arena],
             hit_wall=self.hit_wall[arena],
             outcome=outcome,
         )
+
+
+def _terminates(outcome: Outcome | None) -> bool:
+    return outcome is not None and outcome is not Outcome.TIMEOUT
 
 
 @dataclass(frozen=True, slots=True)

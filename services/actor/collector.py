@@ -16,11 +16,13 @@ from mrcdrl.common.messages.trajectory import (
     Chunk,
     EpisodeSummary,
     Float32Array,
+    Float64Array,
     TimeStep,
     UInt8Array,
 )
 from mrcdrl.common.model.policy import FrameStack, Policy
 from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
+from mrcdrl.services.actor.training_rewards import TrainingRewards
 
 
 @dataclass(slots=True)
@@ -68,6 +70,7 @@ class Collector:
         self._frames = FrameStack(self.num_robots, config.arena.stack, config.arena.view_px)
         self._sequence: Iterator[int] = iter(range(2**62))
         self._episodes = [_Episode() for _ in range(len(arenas))]
+        self._rewards = TrainingRewards(config, arenas)
         self.seconds = Seconds()
         self.env_steps = 0
         self.num_episodes = 0
@@ -100,11 +103,18 @@ class Collector:
         stepped = time.perf_counter()
         taken_q = selection.taken_q.reshape(shape)
         greedy_q = selection.greedy_q.reshape(shape)
+        rewards = self._rewards.after(time_steps, self._policy.learner_step)
         chunks = [
             chunk
             for index, time_step in enumerate(time_steps)
             for chunk in self._add(
-                index, actions[index], taken_q[index], greedy_q[index], time_step, truncate
+                index,
+                actions[index],
+                rewards[index],
+                taken_q[index],
+                greedy_q[index],
+                time_step,
+                truncate,
             )
         ]
         mean_q = greedy_q.mean(axis=1)
@@ -136,6 +146,7 @@ class Collector:
         self,
         index: int,
         actions: UInt8Array,
+        rewards: Float64Array,
         taken_q: Float32Array,
         greedy_q: Float32Array,
         time_step: TimeStep,
@@ -144,7 +155,7 @@ class Collector:
         for robot, chunker in enumerate(self._chunkers[index]):
             yield from chunker.add(
                 int(actions[robot]),
-                float(time_step.rewards[robot]),
+                float(rewards[robot]),
                 time_step.records[robot],
                 taken_q=float(taken_q[robot]),
                 greedy_q=float(greedy_q[robot]),
@@ -163,6 +174,7 @@ class Collector:
             first = index * self._num_robots
             states = slice(first, first + self._num_robots)
             self._frames.reset(states, self._codec.decode(time_step.records))
+        self._rewards.start(indices, self._policy.learner_step)
 
     def _summary(self, index: int, time_step: TimeStep, epsilon: float) -> EpisodeSummary:
         episode = self._episodes[index]

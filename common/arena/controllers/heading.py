@@ -11,7 +11,13 @@ from scipy.optimize import linear_sum_assignment
 from mrcdrl.common.arena.world.rewards import target_distances_px
 from mrcdrl.common.arena.world.scene import STRAIGHT, Scene
 from mrcdrl.common.config import ArenaConfig
-from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float64Array, Int64Array, UInt8Array
+from mrcdrl.common.messages.trajectory import (
+    NUM_ACTIONS,
+    BoolArray,
+    Float64Array,
+    Int64Array,
+    UInt8Array,
+)
 
 Controller = Callable[[Scene], UInt8Array]
 """Chooses actions [K] for a scene; one controller plays one episode."""
@@ -24,6 +30,15 @@ def shortest_assignment(scene: Scene, power: float = 1.0) -> Int64Array:
     """
     _, targets = linear_sum_assignment(target_distances_px(scene) ** power)
     return np.asarray(targets, np.int64)
+
+
+def assigned_distances_px(scene: Scene, taking_part: BoolArray) -> Float64Array:
+    """Distances [N, K] of robots to distinct targets, in each of N arenas with the least sum.
+
+    taking_part: [N, K]; the others leave all targets to these, and their distance is 0.
+    """
+    distances = np.where(taking_part[..., None], target_distances_px(scene), 0.0)
+    return np.array([each[linear_sum_assignment(each)] for each in distances])
 
 
 def remaining_rad(

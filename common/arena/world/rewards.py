@@ -42,9 +42,9 @@ def frame_rewards(
 
 
 def target_distances_px(scene: Scene) -> Float64Array:
-    """Distances [K, M] from the robots' centres to the targets' (the paper's chi)."""
-    gaps = scene.robots[:, None, :2] - scene.targets[None]
-    distances: Float64Array = np.sqrt((gaps * gaps).sum(axis=2))
+    """Distances [..., K, M] from the robots' centres to the targets' (the paper's chi)."""
+    gaps = scene.robots[..., :, None, :2] - scene.targets[..., None, :, :]
+    distances: Float64Array = np.sqrt((gaps * gaps).sum(axis=-1))
     return distances
 
 

@@ -8,9 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrcdrl.common.arena import Arena, Scene
+from mrcdrl.common.arena import Arena, ArenaBatch, Scene
 from mrcdrl.common.arena.controllers import CONTROLLERS, SafeCircle, greedy_actions, make_controller
-from mrcdrl.common.arena.controllers.heading import actions_towards, shortest_assignment
+from mrcdrl.common.arena.controllers.heading import (
+    actions_towards,
+    assigned_distances_px,
+    shortest_assignment,
+)
 from mrcdrl.common.arena.world import starts
 from mrcdrl.common.arena.world.obstacles import reachable_px
 from mrcdrl.common.arena.world.physics import ArrayPhysics
@@ -95,6 +99,39 @@ def test_the_assignment_is_the_shortest_of_all(seed: int, num_robots: int, power
     chosen = shortest_assignment(scene, power)
     assert sorted(chosen.tolist()) == list(range(num_robots))
     assert costs[np.arange(num_robots), chosen].sum() == pytest.approx(min(every))
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.booleans(), min_size=1, max_size=4))
+def test_assigned_distances_are_the_least_in_sum_of_those_who_take_part(
+    seed: int, taking_part: list[bool]
+) -> None:
+    """In each of two arenas, with up to two targets more than robots."""
+    rng, num_robots = np.random.default_rng(seed), len(taking_part)
+    num_targets = num_robots + int(rng.integers(3))
+    robots = rng.uniform(0, 600, (2, num_robots, 3))
+    robots[:, ~np.array(taking_part)] = np.nan  # nobody looks where the others are
+    scenes = Scene(robots, rng.uniform(0, 600, (2, num_targets, 2)))
+    found = assigned_distances_px(scenes, np.array([taking_part] * 2))
+    each = np.flatnonzero(taking_part)
+    for i in range(2):
+        distances = target_distances_px(Scene(robots[i], scenes.targets[i]))
+        choices = permutations(range(num_targets), len(each))
+        least = min(distances[each, list(chosen)].sum() for chosen in choices)
+        assert found[i].sum() == pytest.approx(least)
+        assert (found[i][~np.array(taking_part)] == 0).all()
+        for robot in each:
+            assert np.isclose(distances[robot], found[i, robot]).any()
+
+
+def test_a_robot_that_has_failed_needs_no_target() -> None:
+    batch = ArenaBatch(ArenaConfig(num_robots=3), [np.random.default_rng(0)])
+    batch.reset(0)
+    whole = batch.assigned_distances_px(np.array([0]))
+    assert (whole > 0).all()
+    batch.failed[0, 1] = True
+    left = batch.assigned_distances_px(np.array([0]))
+    assert left[0, 1] == 0
+    assert left.sum() <= whole[0, [0, 2]].sum()
 
 
 def test_with_squares_the_robot_in_the_way_takes_the_farther_target() -> None:

@@ -218,6 +218,12 @@ IMPOSSIBLE = {
     "a schedule going back": ({"exploration.schedule": "[[0, 1], [9, 1], [5, 1]]"}, "rise from 0"),
     "no schedule": ({"exploration.schedule": "[]"}, "rise from 0"),
     "epsilon above 1": ({"exploration.schedule": "[[0, 2.0]]"}, "epsilon outside 0 ... 1"),
+    "shaping that grows": ({"agent.shaping_schedule": "[[0, 2.0]]"}, "factor outside 0 ... 1$"),
+    "shaping from nowhere": ({"agent.shaping_schedule": "[[5, 1.0]]"}, "rise from 0"),
+    "collisions that pay": (
+        {"agent.collision_schedule": "[[0, -1.0]]"},
+        "collision_schedule has a factor outside 0 ... 100",
+    ),
     "never sampled": ({"replay.min_size": "500_000"}, "sampling would never start"),
     "first batch repeats": ({"replay.min_size": "8"}, "first batch would repeat transitions"),
     **{

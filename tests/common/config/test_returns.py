@@ -23,6 +23,20 @@ def test_the_largest_n_step_return_is_that_of_n_frames_and_not_scaled() -> None:
     assert largest_n_step_return(config) == 100 + 2 * 2 + 2 * 1
 
 
+def test_shaping_and_prices_widen_both_bounds() -> None:
+    """By the potential of the arena's diagonal, once, and by the highest price."""
+    more = {
+        "agent.n_step": "2",
+        "agent.reward_scale": "0.1",
+        "agent.shaping_per_px": "0.5",
+        "agent.collision_schedule": "[[0, 1], [9, 4], [10, 3]]",
+    }
+    config = load_config(None, REWARDS | more, environ={})
+    potential = 0.5 * 600 * 2**0.5
+    assert largest_n_step_return(config) == pytest.approx(100 + 2 * 8 + 2 * 1 + potential)
+    assert largest_return(config) == pytest.approx(0.1 * (100 + 5 * 8 + 10 + potential))
+
+
 def test_a_log_policy_widens_the_bound_on_values_alone() -> None:
     plain = load_config(None, REWARDS, environ={})
     more = {"agent.munchausen_alpha": "0.5", "agent.munchausen_temperature": "0.1"}

@@ -59,6 +59,10 @@ class WatchedPolicy:
     def weights_version(self) -> int:
         return self.policy.weights_version
 
+    @property
+    def learner_step(self) -> int:
+        return self.policy.learner_step
+
     def select_actions(
         self, observations: UInt8Array, epsilon: Float32Array, rng: np.random.Generator
     ) -> Selection:

@@ -121,6 +121,7 @@ CHANGES = {
     "agent.gamma": ("0.99", "0.5"),
     "agent.n_step": ("1", "3"),
     "agent.reward_scale": ("1.0", "0.1"),
+    "agent.shaping_per_px": ("0.0", "0.01"),
     "agent.optimizer": ("adam", "rmsprop"),
     "replay.shards": ("1", "2"),
     "learner.initial_weights": ("", "other.safetensors"),
