@@ -35,9 +35,11 @@ def shortest_assignment(scene: Scene, power: float = 1.0) -> Int64Array:
 def assigned_distances_px(scene: Scene, taking_part: BoolArray) -> Float64Array:
     """Distances [N, K] of robots to distinct targets, in each of N arenas with the least sum.
 
-    taking_part: [N, K]; the others leave all targets to these, and their distance is 0.
+    taking_part: [N, K]; the others leave all targets to these, and their distance is 0. Nobody
+    gets a target whose place is NaN.
     """
-    distances = np.where(taking_part[..., None], target_distances_px(scene), 0.0)
+    distances = np.nan_to_num(target_distances_px(scene), nan=np.inf)
+    distances[~taking_part] = 0.0
     return np.array([each[linear_sum_assignment(each)] for each in distances])
 
 

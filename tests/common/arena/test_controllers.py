@@ -105,17 +105,20 @@ def test_the_assignment_is_the_shortest_of_all(seed: int, num_robots: int, power
 def test_assigned_distances_are_the_least_in_sum_of_those_who_take_part(
     seed: int, taking_part: list[bool]
 ) -> None:
-    """In each of two arenas, with up to two targets more than robots."""
+    """In each of two arenas, with up to two targets more than robots; some targets are absent."""
     rng, num_robots = np.random.default_rng(seed), len(taking_part)
     num_targets = num_robots + int(rng.integers(3))
+    absent = int(rng.integers(num_targets - sum(taking_part) + 1))
     robots = rng.uniform(0, 600, (2, num_robots, 3))
     robots[:, ~np.array(taking_part)] = np.nan  # nobody looks where the others are
-    scenes = Scene(robots, rng.uniform(0, 600, (2, num_targets, 2)))
+    targets = rng.uniform(0, 600, (2, num_targets, 2))
+    targets[:, num_targets - absent :] = np.nan
+    scenes = Scene(robots, targets)
     found = assigned_distances_px(scenes, np.array([taking_part] * 2))
     each = np.flatnonzero(taking_part)
     for i in range(2):
         distances = target_distances_px(Scene(robots[i], scenes.targets[i]))
-        choices = permutations(range(num_targets), len(each))
+        choices = permutations(range(num_targets - absent), len(each))
         least = min(distances[each, list(chosen)].sum() for chosen in choices)
         assert found[i].sum() == pytest.approx(least)
         assert (found[i][~np.array(taking_part)] == 0).all()
