@@ -31,6 +31,7 @@ WITHOUT_METRICS = ("status",)  # roles that announce themselves and publish noth
 COUNTERS = of_kind("pace")  # an actor's start at 0 with it; the others' are kept with the run
 SHARES = of_kind("share")
 STALENESS = ("versions", "s")
+INCARNATION = "incarnation"  # a text in Stats
 HISTORY_PERIOD = 10  # episodes between two points of the success curve
 LOG_LINES = 100
 MAX_FORMER = 16  # starts of a service before the present one that are remembered
@@ -123,10 +124,13 @@ class RunState:
         name: it is left out, which is said once.
         """
         service = self._service(stats.role, stats.id)
-        before = service.text.get("incarnation")
-        present = stats.text.get("incarnation", before)
+        before = service.text.get(INCARNATION)
+        present = stats.text.get(INCARNATION, before)
         if present in service.former:
             self._observe_namesake(service)
+            return
+        if not stats.metrics:
+            self._observe_start(service, stats, now)
             return
         restarted = before is not None and before != present
         if before is not None and restarted:
@@ -146,6 +150,12 @@ class RunState:
         stale = self.staleness(service) if stats.role == "actor" else None
         for unit, value in zip(STALENESS, stale or (), strict=False):
             service.staleness.setdefault(unit, SpreadWindow()).observe(value, now)
+
+    def _observe_start(self, service: Service, stats: Stats, now: float) -> None:
+        """Take what a service tells before it has metrics; a restart is taken with the first."""
+        service.alive, service.heard_s = True, now
+        before = service.text.get(INCARNATION)
+        service.text = dict(stats.text) | ({INCARNATION: before} if before else {})
 
     def _observe_namesake(self, service: Service) -> None:
         service.namesakes += 1

@@ -64,6 +64,7 @@ def test_a_run_ends_by_itself_and_prints_plain_lines(finished: Finished) -> None
     assert lines
     for line in lines:
         assert re.match(r"\d+:\d\d:\d\d  .*robot steps \d+ .*replay \d+/20000  learner steps", line)
+    assert "  starting, waiting for " in lines[0]
     assert "\x1b" not in finished.out
     assert "Traceback" not in finished.err
     assert "learner step limit reached (60)" in finished.err
@@ -77,7 +78,8 @@ def test_nothing_of_a_finished_run_is_left_behind(finished: Finished) -> None:
 
 def test_a_run_leaves_its_files(finished: Finished) -> None:
     run = finished.path
-    for name in ("training.png", "trajectories.png", "evaluation.mp4"):
+    plots = [f"{name}.{kind}" for name in ("training", "trajectories") for kind in ("png", "svg")]
+    for name in (*plots, "evaluation.mp4"):
         assert (run / name).stat().st_size > 1000, name
     config = validate_config(tomllib.loads((run / "config.toml").read_text("utf-8")))
     assert (config.arena.view_px, config.run.learner_steps) == (32, 60)

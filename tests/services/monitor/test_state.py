@@ -3,7 +3,14 @@
 import pytest
 
 from mrcdrl.common.config import Config, load_config
-from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
+from mrcdrl.common.messages.trajectory import (
+    COMPILING,
+    DOING,
+    EpisodeSummary,
+    Evaluation,
+    Outcome,
+    Stats,
+)
 from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.recorder import flat_metrics
 from mrcdrl.services.monitor.state import MAX_SERVICES, RunState
@@ -235,3 +242,18 @@ def test_a_peer_that_claims_many_names_does_not_fill_the_memory() -> None:
     assert len(state.services) == MAX_SERVICES
     state.observe_stats(learner(20), 1)
     assert state.learner_steps == 20
+
+
+def test_a_service_that_restarts_and_compiles_first_keeps_the_runs_counters() -> None:
+    state = RunState(config())
+    first, second = {"incarnation": "1"}, {"incarnation": "2"}
+    state.observe_stats(Stats("actor", "a", {"env_steps": 100.0}, first), 0)
+    state.observe_stats(Stats("learner", "l", {"learner_steps": 70.0}, first), 0)
+    state.observe_presence("learner", "l", alive=False)
+    for role, name in (("actor", "a"), ("learner", "l")):
+        state.observe_stats(Stats(role, name, {}, {**second, DOING: COMPILING}), 1)
+    assert [service.compiling for service in state.services] == [True, True]
+    assert (state.env_steps, state.learner_steps) == (100, 70)
+    state.observe_stats(Stats("actor", "a", {"env_steps": 130.0}, second), 2)
+    assert state.env_steps == 230
+    assert [service.compiling for service in state.services] == [False, True]
