@@ -37,10 +37,10 @@ from mrcdrl.common.arena import ArenaBatch, make_codec
 from mrcdrl.common.config import AgentConfig, ArenaConfig, LearnerConfig
 from mrcdrl.common.messages.trajectory import NUM_ACTIONS
 from mrcdrl.common.model.q_network import Precision
+from mrcdrl.common.runtime.files import METRICS
 from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.services.learner.batch import Batch
 from mrcdrl.services.learner.learner import Learner
-from mrcdrl.services.monitor.records import METRICS
 
 _BATCHES = 8  # in turns, as the harness does
 _STACK, _VIEW_PX = 4, 60

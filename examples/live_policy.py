@@ -11,9 +11,8 @@ import numpy as np
 from mrcdrl import ArenaParallelEnv, LivePolicy
 
 
-def main(run_dir: Path, episodes: int = 20) -> None:
-    endpoint = (run_dir / "endpoint").read_text()
-    with LivePolicy(run_dir.name, endpoint, epsilon=0.01) as policy:
+def main(run: str | Path, episodes: int = 20) -> None:
+    with LivePolicy.of_run(run, epsilon=0.01) as policy:
         env = ArenaParallelEnv(policy.config.arena)
         successes = 0
         for episode in range(1, episodes + 1):
@@ -26,4 +25,4 @@ def main(run_dir: Path, episodes: int = 20) -> None:
 
 
 if __name__ == "__main__":
-    main(Path("runs") / sys.argv[1])
+    main(sys.argv[1])

@@ -15,20 +15,21 @@ from mrcdrl.common.model.q_network import precision
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import network_from_bytes
 from mrcdrl.common.runtime.files import BEST_WEIGHTS, CHECKPOINT_MANIFEST, RUN_CONFIG
+from mrcdrl.common.runtime.runs import find_weights
 
 
 def load_policy(source: str | Path, config: Config | None = None) -> Policy:
-    """Load the policy of a run directory or of a .safetensors file, on the CPU.
+    """Load the policy of a run or of a .safetensors file, on the CPU.
 
-    source: a run directory stands for its best weights, or else its newest checkpoint. config: by
-    default the run's own, or else the preset `quick`; it sets the precision and the arena, whose
-    images the network must fit.
+    source: a file, or a run (its name, its path, or `latest`), which stands for its best weights,
+    or else its newest checkpoint's. config: by default the run's own, or else the preset `quick`;
+    it sets the precision and the arena, whose images the network must fit.
 
     The policy acts on states uint8 [N, S, V, V]: the last S images of V x V px of N robots, oldest
-    first. Raises CheckpointError if there are no weights, or if they are unreadable, damaged or do
-    not fit the arena; ConfigError for a wrong configuration.
+    first. Raises RunDirectoryError for an unknown run, CheckpointError if there are no weights, or
+    if they are unreadable, damaged or do not fit the arena, ConfigError for a wrong configuration.
     """
-    path = weights_path(Path(source))
+    path = weights_path(find_weights(str(source)))
     return policy_of(path, read_saved(path), config or load_config(config_beside(path)))
 
 

@@ -10,8 +10,10 @@ import os
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".part"
-RUN_CONFIG = "config.toml"  # in a run directory, as BEST_WEIGHTS
-BEST_WEIGHTS = Path("checkpoints") / "best.safetensors"
+WEIGHTS_SUFFIX = ".safetensors"
+RUN_CONFIG = "config.toml"  # in a run directory, as all below
+METRICS = "metrics.jsonl"
+BEST_WEIGHTS = Path("checkpoints") / f"best{WEIGHTS_SUFFIX}"
 CHECKPOINT_MANIFEST = "manifest.json"
 
 

@@ -16,6 +16,7 @@ from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transpo
 from mrcdrl.common.errors import DeadlineError, UnreachableError, WireError
 from mrcdrl.common.runtime.names import check_name, printable
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.runs import add_run, is_run, run_path, unknown_run
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 
@@ -42,9 +43,10 @@ class Joining:
     def from_arguments(cls, arguments: argparse.Namespace) -> Self:
         """Read the flags of `joining_parser`.
 
-        Raises UnreachableError if neither --connect nor the run directory names an endpoint.
+        Raises ConfigError without a run, UnreachableError if neither --connect nor the run
+        directory names an endpoint.
         """
-        run_dir = arguments.run_dir / check_name(arguments.run, "run name")
+        run_dir = run_path(arguments.run, arguments.run_dir)
         host_and_process = f"{socket.gethostname()}-{os.getpid()}"
         worker = arguments.id or re.sub(r"[^A-Za-z0-9-]", "-", host_and_process)
         given = overrides(arguments)
@@ -52,7 +54,7 @@ class Joining:
         endpoints = arguments.connect or transport.connect
         endpoints = tuple(endpoints or [recorded_endpoint(run_dir, "--connect")])
         transport = transport.model_copy(update={"connect": endpoints, "listen": ()})
-        return cls(arguments.run, check_name(worker, "--id"), run_dir, transport, given)
+        return cls(run_dir.name, check_name(worker, "--id"), run_dir, transport, given)
 
     @property
     def keys(self) -> Keys:
@@ -62,10 +64,9 @@ class Joining:
 def joining_parser(command: str, description: str) -> Parser:
     """The flags of a command that joins a run."""
     parser = Parser(prog=f"mrcdrl {command}", description=description)
-    parser.add_argument("--run", required=True, help="the run's name")
+    add_run(parser)
     parser.add_argument("--connect", action="append", help="endpoint, such as tcp/HOST:7447")
     parser.add_argument("--id", help="this worker's name; default: from the host and process")
-    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
     add_transport_flag(parser)
     add_config_flags(parser)
     return parser
@@ -79,9 +80,8 @@ def recorded_endpoint(run_dir: Path, flag: str) -> str:
     try:
         return (run_dir / ENDPOINT_FILE).read_text("utf-8").strip()
     except OSError as error:
-        raise UnreachableError(
-            f"no run is up in {run_dir}; give {flag}, such as tcp/127.0.0.1:7447"
-        ) from error
+        why = f"no run is up in {run_dir}" if is_run(run_dir) else unknown_run(run_dir)
+        raise UnreachableError(f"{why}; give {flag}, such as tcp/127.0.0.1:7447") from error
 
 
 def fetch_config(

@@ -1,6 +1,6 @@
 """Acting with the newest weights of a run that is up, from outside the run.
 
-    with LivePolicy("four", "tcp/127.0.0.1:7447") as policy:
+    with LivePolicy.of_run("four") as policy:
         actions = policy.act(images)  # uint8 [N, V, V] in, uint8 [N] out
 
 Invariants: weights only ever get newer; weights that are torn, altered or of another network are
@@ -11,6 +11,7 @@ thread. It asks for the configuration, and for weights: the first, or after a lo
 import contextlib
 import time
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,8 @@ from mrcdrl.common.messages.trajectory import UInt8Array, Weights
 from mrcdrl.common.model.policy import FrameStack, make_policy
 from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.common.sync.joining import Joining, fetch_config
+from mrcdrl.common.runtime.runs import run_path
+from mrcdrl.common.sync.joining import Joining, fetch_config, recorded_endpoint
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session
 
@@ -60,6 +62,24 @@ class LivePolicy(Closing):
                     f"no weights of run {run!r} came within {timeout_s:g} s; is its learner up?"
                 )
             self._opened = opened.pop_all()
+
+    @classmethod
+    def of_run(
+        cls,
+        run: str | Path,
+        *,
+        epsilon: float = 0.0,
+        seed: int = 0,
+        timeout_s: float = 30.0,
+    ) -> Self:
+        """Follow a run that `mrcdrl train` has started on this machine.
+
+        run: its name, its path, or `latest`; the other arguments are those of the class. Raises
+        UnreachableError if the run is not up or there is none of that name.
+        """
+        path = run_path(str(run))
+        endpoint = recorded_endpoint(path, "LivePolicy its endpoint")
+        return cls(path.name, endpoint, epsilon=epsilon, seed=seed, timeout_s=timeout_s)
 
     def close(self) -> None:
         """Leave the run; harmless if repeated."""

@@ -16,12 +16,11 @@ from mrcdrl.common.config import Config
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.trajectory import EpisodeSummary
 from mrcdrl.common.runtime.closing import Closing
-from mrcdrl.common.runtime.files import atomic_write
+from mrcdrl.common.runtime.files import METRICS, atomic_write
 from mrcdrl.services.monitor.events import Events
 from mrcdrl.services.monitor.records import (
     EPISODES,
     EVALUATIONS,
-    METRICS,
     EpisodeRecord,
     EvaluationRecord,
     cut_torn_line,

@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
+from mrcdrl.common.runtime.files import METRICS
 
 Record = TypeVar("Record")
 
 EPISODES = "episodes.jsonl"
 EVALUATIONS = "evaluations.jsonl"
-METRICS = "metrics.jsonl"
 SUCCESS_WINDOW = 100  # episodes over which successes are counted (Table 1, Fig. 6b)
 _TAIL_BYTES = 1 << 20
 

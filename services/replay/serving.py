@@ -9,6 +9,7 @@ from mrcdrl.common.config import Config, TransportConfig, load_config, refuse_ch
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.runtime.files import RUN_CONFIG
 from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.runtime.runs import add_run, run_path
 from mrcdrl.common.sync.joining import recorded_endpoint
 from mrcdrl.common.transport.keys import Keys
 
@@ -32,7 +33,7 @@ class Serving:
         RunDirectoryError if they change what the records in that directory depend on.
         """
         parser = Parser(prog="mrcdrl replay", description="Serve the replay table of a run.")
-        parser.add_argument("--run", required=True, help="the run's name")
+        add_run(parser)
         parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
         parser.add_argument("--listen", action="append", help="endpoint, as tcp/127.0.0.1:7447")
         parser.add_argument("--connect", action="append", help="a router's endpoint, instead")
@@ -40,12 +41,9 @@ class Serving:
             "--shard", type=whole_number(0), default=0, help="number among replay.shards, from 0"
         )
         parser.add_argument("--id", help="this worker's name; default: from the shard")
-        parser.add_argument(
-            "--run-dir", type=Path, default=Path("runs"), help="where runs are kept"
-        )
         add_config_flags(parser)
         arguments = parser.parse_args(argv)
-        run_dir = arguments.run_dir / check_name(arguments.run, "run name")
+        run_dir = run_path(arguments.run, arguments.run_dir)
         own = _config_of(run_dir)
         config = load_config(arguments.config or own, overrides(arguments))
         if own is not None:
@@ -60,7 +58,7 @@ class Serving:
         if not 0 <= shard < config.replay.shards:
             parser.error(f"--shard {shard}: the run has {config.replay.shards} (replay.shards)")
         worker = check_name(arguments.id or f"replay-{shard}", "--id")
-        return cls(arguments.run, worker, shard, run_dir, config, transport)
+        return cls(run_dir.name, worker, shard, run_dir, config, transport)
 
     @property
     def keys(self) -> Keys:

@@ -15,8 +15,10 @@ from rich.console import Console
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.errors import DeadlineError, RunDirectoryError, UnreachableError
+from mrcdrl.common.runtime.files import METRICS
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.runs import is_run, run_path
 from mrcdrl.common.runtime.versions import VERSIONED
 from mrcdrl.common.sync.joining import ENDPOINT_FILE, Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
@@ -25,7 +27,7 @@ from mrcdrl.services.monitor.display import Show, at_most_every, display
 from mrcdrl.services.monitor.follower import Follower
 from mrcdrl.services.monitor.phase import progress
 from mrcdrl.services.monitor.recorder import Recorder, flat_metrics, restore
-from mrcdrl.services.monitor.records import METRICS, finite, read_last_metrics
+from mrcdrl.services.monitor.records import finite, read_last_metrics
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.screen import Screen, clock
 from mrcdrl.services.monitor.state import RunState
@@ -113,9 +115,13 @@ def _join_now(
             session = opened.enter_context(Session(joining.transport, open_timeout_s=0.0))
             config = fetch_config(session, joining, stop, 0.0)
         except (UnreachableError, DeadlineError) as error:
-            seen = last_seen(arguments.run_dir / arguments.run)
+            run_dir = run_path(arguments.run, arguments.run_dir)
+            if not (is_run(run_dir) or arguments.connect):
+                raise
             why = str(error).partition(";")[0]
-            raise UnreachableError(f"run {arguments.run} is not up: {why}; {seen}") from error
+            raise UnreachableError(
+                f"run {run_dir.name} is not up: {why}; {last_seen(run_dir)}"
+            ) from error
         owned.push(opened.pop_all())
         return joining, session, config
 

@@ -15,8 +15,9 @@ import numpy as np
 from mrcdrl.common.arena import Scene, literal_views, make_codec, render_arena, test_starts
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.config.arguments import Parser, whole_number
-from mrcdrl.common.errors import ConfigError, RunDirectoryError
+from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
+from mrcdrl.common.runtime.runs import find_run, find_weights
 from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import Path2D, check_suffix, trajectories
 from mrcdrl.services.plots.paper import (
@@ -58,7 +59,7 @@ def _parser() -> Parser:
     parser = Parser(prog="mrcdrl figure", description=__doc__)
     parser.add_argument("figure", choices=list(_FIGURES), help="which figure")
     parser.add_argument(
-        "weights", nargs="*", type=Path, help=".safetensors files or run directories"
+        "weights", nargs="*", help="runs (name, path, or latest) or .safetensors files"
     )
     parser.add_argument("--out", type=Path, required=True, help="the .png or .svg to write")
     parser.add_argument(
@@ -143,10 +144,7 @@ def _curves(arguments: argparse.Namespace) -> None:
     """Plot the records of runs; no episode is played."""
     if not arguments.weights or arguments.controller:
         raise ConfigError("curves takes run directories only")
-    for run_dir in arguments.weights:
-        if not run_dir.is_dir():
-            raise RunDirectoryError(f"{run_dir} is not a directory")
-    curves(arguments.weights, arguments.out)
+    curves([find_run(run, arguments.run_dir) for run in arguments.weights], arguments.out)
 
 
 _FIGURES: dict[str, Callable[[argparse.Namespace], None]] = {
@@ -161,9 +159,9 @@ _FIGURES: dict[str, Callable[[argparse.Namespace], None]] = {
 def _subjects(arguments: argparse.Namespace) -> list[Subject]:
     """The subjects named, weights first; controllers play in the arena of the first."""
     subjects = []
-    for path in arguments.weights:
+    for word in arguments.weights:
         alone = copy.copy(arguments)
-        alone.weights, alone.controller = path, None
+        alone.weights, alone.controller = word, None
         subjects.append(subject(alone))
     config = subjects[0].config if subjects else config_without_weights(arguments)
     return subjects + [controlled(name, config) for name in arguments.controller]
@@ -176,7 +174,8 @@ def _one(arguments: argparse.Namespace) -> Subject:
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:
-    return [*(path.resolve().stem for path in arguments.weights), *arguments.controller]
+    paths = [find_weights(word, arguments.run_dir) for word in arguments.weights]
+    return [*(path.resolve().stem for path in paths), *arguments.controller]
 
 
 def _paths(episodes: Sequence[EpisodeResult]) -> list[Path2D]:

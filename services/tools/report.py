@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mrcdrl.common.config.arguments import Parser
-from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.runtime.runs import add_run, find_run
 from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
 from mrcdrl.services.plots.film import write_film
 from mrcdrl.services.plots.paper import SUFFIXES
@@ -20,10 +20,9 @@ _SEED = 0
 def main(argv: Sequence[str]) -> int:
     """Write the plots and the film; return the exit code."""
     parser = Parser(prog="mrcdrl report", description="Write the plots and the film of a run.")
-    parser.add_argument("run", type=Path, help="the run directory")
-    run_dir: Path = parser.parse_args(argv).run
-    if not run_dir.is_dir():
-        raise RunDirectoryError(f"{run_dir} is not a directory")
+    add_run(parser)
+    arguments = parser.parse_args(argv)
+    run_dir = find_run(arguments.run, arguments.run_dir)
     training_curve(run_dir, *plots(run_dir, "training"))
     draw_episodes(run_dir)
     return 0

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.saved_policy import config_beside, policy_of, read_saved, weights_path
+from mrcdrl.common.runtime.runs import add_run_dir, find_weights
 from mrcdrl.services.evaluator.trial import (
     ControllerPlayer,
     EpisodeResult,
@@ -56,7 +56,7 @@ def subject_parser(command: str, description: str) -> Parser:
     """Make a parser with the flags that name a subject."""
     parser = Parser(prog=f"mrcdrl {command}", description=description)
     parser.add_argument(
-        "weights", nargs="?", type=Path, help="a .safetensors file or a run directory"
+        "weights", nargs="?", help="a run (its name, its path, or latest) or a .safetensors file"
     )
     parser.add_argument("--controller", help=f"instead of weights: {', '.join(CONTROLLERS)}")
     add_arena_flags(parser)
@@ -77,6 +77,7 @@ def parse_with_episodes(parser: Parser, argv: Sequence[str], num: int) -> argpar
 def add_arena_flags(parser: Parser) -> None:
     """Add the flags that set the arena of a subject."""
     parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
+    add_run_dir(parser)
     add_config_flags(parser, {"arena.num_robots": "--robots"})
 
 
@@ -88,14 +89,15 @@ def config_without_weights(arguments: argparse.Namespace) -> Config:
 def subject(arguments: argparse.Namespace) -> Subject:
     """The subject that the flags name.
 
-    Raises ConfigError for contradictory flags and unknown controllers, CheckpointError for weights
-    that cannot be read, are not ours, or do not fit the arena.
+    Raises ConfigError for contradictory flags and unknown controllers, RunDirectoryError for an
+    unknown run, CheckpointError for weights that cannot be read, are not ours, or do not fit the
+    arena.
     """
     if (arguments.weights is None) == (arguments.controller is None):
         raise ConfigError("give either weights or --controller")
     if arguments.controller is not None:
         return controlled(arguments.controller, config_without_weights(arguments))
-    path = weights_path(arguments.weights)
+    path = weights_path(find_weights(arguments.weights, arguments.run_dir))
     config = load_config(arguments.config or config_beside(path), overrides(arguments))
     torch.set_num_threads(config.evaluator.threads)
     weights = read_saved(path)

@@ -4,6 +4,7 @@ Invariants: what no service could do is refused before anything is written; the 
 without its plots.
 """
 
+import argparse
 import contextlib
 import logging
 import os
@@ -18,8 +19,8 @@ from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.extras import require
-from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import COMMAND, DIE_WITH_PARENT, StopSignal
+from mrcdrl.common.runtime.runs import add_run_dir, find_run, new_run_path
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display
@@ -51,18 +52,19 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     """Create or resume the run that the command line asks for."""
     parser = Parser(prog="mrcdrl train", description="Train on this machine, with all processes.")
     parser.add_argument("--config", help=f"a preset or a TOML file; {DEFAULT_PRESET} by default")
-    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
-    parser.add_argument("--name", help="the run's name; made of preset, robots and time by default")
-    parser.add_argument("--resume", metavar="RUN", help="continue this run")
+    parser.add_argument(
+        "name", nargs="?", default=argparse.SUPPRESS, metavar="NAME", help="the new run's name"
+    )
+    parser.add_argument("--name", help="the same; made of preset, robots and time by default")
+    parser.add_argument("--resume", metavar="RUN", help="go on with this run: name, path or latest")
+    add_run_dir(parser)
     add_config_flags(parser, _SHORT)
     arguments = parser.parse_args(argv)
     given = overrides(arguments)
     if arguments.resume:
         if arguments.name or arguments.config:
             parser.error("--resume keeps the run's name and configuration: no --name or --config")
-        resumed = Path(arguments.resume)
-        folder = resumed.parent if len(resumed.parts) > 1 else arguments.run_dir
-        path = folder / check_name(resumed.name, "run name")
+        path = find_run(arguments.resume, arguments.run_dir)
 
         def check(before: Config, now: Config) -> None:
             check_possible(now, resumed=True)
@@ -73,7 +75,7 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     config = load_config(preset, given)
     check_possible(config)
     name = arguments.name or default_name(preset, config.arena.num_robots)
-    path = arguments.run_dir / check_name(name, "run name")
+    path = new_run_path(name, arguments.run_dir)
     return (RunDirectory.create if arguments.name else RunDirectory.create_free)(path, config)
 
 

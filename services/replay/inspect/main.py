@@ -12,6 +12,7 @@ from rich.table import Table
 from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.runtime.files import RUN_CONFIG
+from mrcdrl.common.runtime.runs import add_run, find_run
 from mrcdrl.services.replay.inspect.contents import log_directory, read_contents
 from mrcdrl.services.replay.inspect.export import write_export
 from mrcdrl.services.replay.inspect.summary import summarize
@@ -23,8 +24,7 @@ def main(argv: Sequence[str]) -> int:
     """Read the log and show it; return the exit code."""
     description = "Show what the replay log of a run holds."
     parser = Parser(prog="mrcdrl replay inspect", description=description)
-    parser.add_argument("run", type=Path, help="the run directory, or its name under --run-dir")
-    parser.add_argument("--run-dir", type=Path, default=Path("runs"), help="where runs are kept")
+    add_run(parser)
     parser.add_argument(
         "--shard", type=whole_number(0), default=0, help="the replay shard; default: 0"
     )
@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--export", type=Path, metavar="FILE.npz", help="write the transitions")
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
-    run = arguments.run if arguments.run.is_dir() else arguments.run_dir / arguments.run
+    run = find_run(arguments.run, arguments.run_dir)
     directory = log_directory(run, arguments.shard)
     config = _config(run, arguments.config, overrides(arguments))
     contents = read_contents(directory, config, records=arguments.export is not None)

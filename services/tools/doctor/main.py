@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 import json
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -14,6 +13,7 @@ from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
 from mrcdrl.common.errors import EndpointError
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.runs import add_run, runs_folder
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.services.tools.doctor.finding import Finding, failed
 from mrcdrl.services.tools.doctor.machine import of_this_machine
@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
     if arguments.run:
         found, config = look_at_run(arguments)
     own = config or load_config(arguments.config, overrides(arguments))
-    found += of_this_machine(own, arguments.run_dir, running=config is not None)
+    found += of_this_machine(own, runs_folder(arguments.run_dir), running=config is not None)
     if arguments.json:
         lines = [dataclasses.asdict(finding) for finding in found]
         Console(soft_wrap=True).out(json.dumps(lines), highlight=False)
@@ -42,9 +42,8 @@ def main(argv: Sequence[str]) -> int:
 def parser() -> Parser:
     """Make the command's parser."""
     made = Parser(prog="mrcdrl doctor", description="Check this machine and a run.")
-    made.add_argument("--run", help="also check this run, which is up")
+    add_run(made, "also check this run, which is up")
     made.add_argument("--connect", action="append", help="its endpoint, such as tcp/HOST:7447")
-    made.add_argument("--run-dir", type=Path, default=Path("runs"), help="directory of the runs")
     made.add_argument("--config", help="a preset or a TOML file; default: the run's")
     made.add_argument("--json", action="store_true", help="print the findings as JSON")
     made.set_defaults(id="doctor", transport=None)

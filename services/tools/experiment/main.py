@@ -17,6 +17,7 @@ from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.runtime.files import atomic_write, reason
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.runs import runs_folder
 from mrcdrl.services.monitor.records import to_line
 from mrcdrl.services.tools.experiment.cell import CellFiles
 from mrcdrl.services.tools.experiment.grid import read_grid
@@ -31,7 +32,7 @@ _REPORT_S = 30.0
 def main(argv: Sequence[str]) -> int:
     """Run the cells; return the exit code: 0 if all that were asked for are done."""
     arguments = _parse(argv)
-    out = arguments.out or Path("runs") / "experiments" / arguments.grid.stem
+    out = arguments.out or runs_folder() / "experiments" / arguments.grid.stem
     every = [CellFiles(cell, out) for cell in read_grid(arguments.grid)]
     asked = [f for f in every if fnmatch.fnmatchcase(f.cell.name, arguments.only)]
     if not asked:

@@ -17,9 +17,10 @@ from mrcdrl.common.config import DEFAULT_PRESET, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.cores import available_cores
-from mrcdrl.common.runtime.names import check_name
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.runs import add_run, run_path
 from mrcdrl.common.runtime.versions import all_versions
+from mrcdrl.common.sync.joining import recorded_endpoint
 from mrcdrl.services.monitor.summary import machine
 from mrcdrl.services.tools.simulate.simulation import Demand, simulation
 from mrcdrl.services.tools.simulate.target import NAME, joined, own
@@ -40,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     with ExitStack() as owned:
         target = owned.enter_context(
             joined(arguments.run, arguments.connect, given, stop)
-            if arguments.connect
+            if arguments.run
             else own(load_config(preset, given), router=arguments.router)
         )
         simulated = owned.enter_context(simulation(demand, target, f"simulated-{os.getpid()}"))
@@ -73,16 +74,16 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--publications", type=_frequency, help="of weights a second; default: 1")
     parser.add_argument("--router", action="store_true", help="put a router in front of replay")
     parser.add_argument("--config", help=f"a preset or a TOML file; default: {DEFAULT_PRESET}")
-    parser.add_argument("--run", help=f"join this run instead; its name begins with {NAME}")
+    add_run(parser, f"join this run, whose name begins with {NAME}")
     parser.add_argument("--connect", help="the run's endpoint, such as tcp/127.0.0.1:7447")
     parser.add_argument(
         "--force", action="store_true", help="join any run; its learner then trains on made-up data"
     )
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
-    if bool(arguments.run) != bool(arguments.connect):
-        parser.error("--run and --connect go together; without them replay is started here")
-    if arguments.connect:
+    if arguments.connect and not arguments.run:
+        parser.error("--connect needs the run's name; without both replay is started here")
+    if arguments.run:
         _check_joining(parser, arguments)
     elif arguments.publications is None:
         arguments.publications = 1.0
@@ -91,13 +92,15 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _check_joining(parser: Parser, arguments: argparse.Namespace) -> None:
-    """Refuse flags that the run decides, and runs that are not meant for made-up data."""
-    check_name(arguments.run, "run name")
+    """Find the run; refuse flags that it decides, and one that is not meant for made-up data."""
+    run_dir = run_path(arguments.run, arguments.run_dir)
+    arguments.run = run_dir.name
+    arguments.connect = arguments.connect or recorded_endpoint(run_dir, "--connect")
     settled = [f"--{name}" for name in ("config", "router") if getattr(arguments, name)]
     settled += ["--publications"] * (arguments.publications is not None)
     settled += [f"--{n}" for n in overrides(arguments) if not n.startswith("transport.")]
     if settled:
-        parser.error(f"{settled[0]} is set by the run: not allowed with --connect")
+        parser.error(f"{settled[0]} is set by the run that is joined")
     if not (arguments.run.startswith(NAME) or arguments.force):
         parser.error(
             f"run {arguments.run!r} would train on made-up data; give a run whose name begins "

@@ -241,7 +241,7 @@ def test_exported_arrays_are_the_tables_transitions(
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["nobody"], r"nobody is not a directory"),
+        (["nobody"], r"no run 'nobody' in .*; `mrcdrl runs` lists all"),
         (["bare"], r"bare has no replay log: .*replay/0 is missing$"),
         (["four", "--shard", "3"], r"replay/3 is missing; its shards are 0"),
         (["four", "--export", "missing/x.npz"], r"cannot write missing/x.npz: No such file"),
@@ -251,7 +251,7 @@ def test_what_is_missing_is_one_clear_error(
     tmp_path: Path, arguments: list[str], reason: str
 ) -> None:
     make_run(tmp_path)
-    (tmp_path / "bare").mkdir()
+    (tmp_path / "bare" / "checkpoints").mkdir(parents=True)
     with pytest.raises(RunDirectoryError, match=reason):
         main([*arguments, "--run-dir", str(tmp_path)])
 
@@ -268,5 +268,7 @@ def test_it_is_a_command_of_two_words(
     assert cli.main() == 0
     assert "128 transitions" in capsys.readouterr().out
     monkeypatch.setattr("sys.argv", ["mrcdrl", "replay", "inspect", "nobody"])
+    monkeypatch.setenv("MRCDRL_RUN_DIR", str(tmp_path))
     assert cli.main() == 1
-    assert capsys.readouterr().err == "mrcdrl: runs/nobody is not a directory\n"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("mrcdrl: no run 'nobody' in ")

@@ -127,6 +127,7 @@ def test_trajectories_of_a_run(tmp_path: Path, run_dir: Path) -> None:
 def test_curves_name_their_runs(tmp_path: Path, run_dir: Path) -> None:
     other = tmp_path / "empty"
     other.mkdir()
+    (other / "config.toml").touch()
     out = tmp_path / "curves.svg"
     assert main(["curves", str(run_dir), str(other), "--out", str(out)]) == 0
     text = out.read_text("utf-8")
@@ -153,7 +154,7 @@ def test_curves_name_their_runs(tmp_path: Path, run_dir: Path) -> None:
         (["comparison", "--controller", "greedy"], ConfigError, "at least two"),
         (["curves"], ConfigError, "takes run directories only"),
         (["curves", "a", "--controller", "greedy"], ConfigError, "takes run directories only"),
-        (["curves", "missing"], RunDirectoryError, "missing is not a directory"),
+        (["curves", "missing"], RunDirectoryError, "no run 'missing'"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(

@@ -4,12 +4,13 @@ import math
 import os
 import resource
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mrcdrl.common.config import load_config
-from mrcdrl.common.errors import ConfigError
+from mrcdrl.common.errors import ConfigError, UnreachableError
 from mrcdrl.services.replay.table import Table
 from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
 from mrcdrl.services.tools.simulate.load import Load, Totals, Usage, bottleneck, busy_cores, latency
@@ -94,8 +95,7 @@ REFUSED = {
     "no time": (["--minutes", "0"], "--minutes"),
     "no rate": (["--rate", "-3"], "--rate"),
     "no frequency": (["--publications", "nan"], "--publications"),
-    "a run without endpoint": (["--run", "simulate-1"], "--run and --connect"),
-    "an endpoint without run": (["--connect", "tcp/127.0.0.1:1"], "--run and --connect"),
+    "an endpoint without run": (["--connect", "tcp/127.0.0.1:1"], "needs the run's name"),
     "a real run": (["--run", "four", "--connect", "tcp/127.0.0.1:1"], "'simulate', or --force"),
     "settings of a run": (
         ["--run", "simulate-1", "--connect", "tcp/127.0.0.1:1", "--replay.capacity", "9"],
@@ -114,6 +114,11 @@ def test_bad_input_is_refused(
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_a_run_that_is_not_up_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnreachableError, match=r"no run 'simulate-1'.*give --connect"):
+        main(["simulate-1", "--run-dir", str(tmp_path)])
 
 
 def test_too_few_open_files_are_reported_before_anything_starts(
