@@ -14,7 +14,7 @@ from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.q_network import precision
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import network_from_bytes
-from mrcdrl.common.runtime.files import BEST_WEIGHTS, CHECKPOINT_MANIFEST, RUN_CONFIG
+from mrcdrl.common.runtime.files import BEST_WEIGHTS, CHECKPOINT_MANIFEST, RUN_CONFIG, sha256
 from mrcdrl.common.runtime.runs import find_weights
 
 
@@ -58,10 +58,16 @@ def config_beside(path: Path) -> str:
 
 
 def read_saved(path: Path) -> Weights:
-    """Read weights, with version and learner step from the manifest beside them, or else 0."""
+    """Read weights, with version and learner step from the manifest beside them, or else 0.
+
+    Raises CheckpointError for weights that cannot be read, or whose digest is not the manifest's.
+    """
     payload, manifest = read_weights(path)
     if not manifest and (path.parent / CHECKPOINT_MANIFEST).is_file():
+        digest = sha256(payload)
         manifest = json.loads((path.parent / CHECKPOINT_MANIFEST).read_bytes())
+        if manifest.get("sha256", {}).get(path.name, digest) != digest:
+            raise CheckpointError(f"{path} is damaged: its digest is not the manifest's")
     return Weights.of(
         epoch=int(manifest.get("weights_epoch", 0)),
         version=int(manifest.get("weights_version", 0)),

@@ -1,8 +1,10 @@
 """The subject of a command: weights or a controller, and its arena, as named by flags."""
 
 import argparse
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,6 +25,8 @@ from mrcdrl.services.evaluator.trial import (
     PolicyPlayer,
     play,
 )
+
+_LOG = logging.getLogger("mrcdrl")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +102,21 @@ def subject(arguments: argparse.Namespace) -> Subject:
     if arguments.controller is not None:
         return controlled(arguments.controller, config_without_weights(arguments))
     path = weights_path(find_weights(arguments.weights, arguments.run_dir))
-    config = load_config(arguments.config or config_beside(path), overrides(arguments))
+    own = config_beside(path)
+    config = load_config(arguments.config or own, overrides(arguments))
+    _say_other_robots(path, own, config)
     torch.set_num_threads(config.evaluator.threads)
     weights = read_saved(path)
     return Subject(config, policy_of(path, weights, config), None, weights)
+
+
+def _say_other_robots(path: Path, own: str, config: Config) -> None:
+    """Say so if the weights were trained with another number of robots; own: their run's file."""
+    if own == DEFAULT_PRESET:
+        return  # they are of no run
+    learned, now = load_config(own, environ={}).arena.num_robots, config.arena.num_robots
+    if learned != now:
+        _LOG.warning("%s: trained with %d robots, plays with %d", path, learned, now)
 
 
 def controlled(name: str, config: Config) -> Subject:

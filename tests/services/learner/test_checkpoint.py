@@ -218,12 +218,36 @@ def test_a_failed_write_leaves_the_old_file(
     assert names(tmp_path) == ["best.json", "best.safetensors"]
 
 
+def test_a_writer_that_is_killed_between_its_files_leaves_the_old_weights_and_what_is_known_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "best.safetensors"
+    for rate, payload in enumerate((b"oldest", b"old")):
+        write_weights(path, payload, {"success_rate": rate})
+
+    def killed_before_the_payload(target: Path, content: bytes) -> None:
+        if target == path:
+            raise KeyboardInterrupt
+        atomic_write(target, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mrcdrl.common.model.weights_files.atomic_write", killed_before_the_payload)
+        with pytest.raises(KeyboardInterrupt):
+            write_weights(path, b"new", {"success_rate": 2})
+    payload, manifest = read_weights(path)
+    assert (payload, manifest["success_rate"]) == (b"old", 1)
+    assert "replaced" not in manifest
+    write_weights(path, b"new", {"success_rate": 2})
+    assert read_weights(path)[1]["success_rate"] == 2
+
+
 def test_kept_weights_come_with_what_is_known_of_them_and_of_no_others(tmp_path: Path) -> None:
     path = tmp_path / "best.safetensors"
     write_weights(path, b"payload", {"version": 7})
     assert read_weights(path)[1]["version"] == 7
     atomic_write(path, b"newer")
-    assert read_weights(path) == (b"newer", {})
+    with pytest.raises(CheckpointError, match=r"damaged: .* not that of best\.json"):
+        read_weights(path)
     path.with_suffix(".json").unlink()
     assert read_weights(path) == (b"newer", {})
     with pytest.raises(CheckpointError, match="No such file"):

@@ -12,6 +12,7 @@ from mrcdrl.common.errors import CheckpointError, ConfigError
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_files import write_weights
 from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.runtime.files import sha256
 from mrcdrl.services.evaluator.trial import ControllerPlayer, PolicyPlayer
 from mrcdrl.services.tools.subject import Subject, subject, subject_parser
 
@@ -61,11 +62,28 @@ def test_weights_without_a_manifest_are_version_0(tmp_path: Path, payload: bytes
     assert named(tmp_path / "some.safetensors", VIEW).weights.order == (0, 0)
 
 
-def test_the_manifest_of_other_weights_is_ignored(tmp_path: Path, payload: bytes) -> None:
+def test_damaged_weights_are_refused(tmp_path: Path, payload: bytes) -> None:
+    altered = payload[:-1] + bytes([payload[-1] ^ 1])  # as valid as before, to the network
     write_weights(tmp_path / "best.safetensors", payload, {"weights_version": 7})
-    manifest = json.loads((tmp_path / "best.json").read_text())
-    (tmp_path / "best.json").write_text(json.dumps({**manifest, "sha256": "0" * 64}))
-    assert named(tmp_path / "best.safetensors", VIEW).weights.version == 0
+    (tmp_path / "best.safetensors").write_bytes(altered)
+    with pytest.raises(CheckpointError, match=r"best\.safetensors are damaged"):
+        named(tmp_path / "best.safetensors", VIEW)
+    (tmp_path / "manifest.json").write_text(
+        json.dumps({"sha256": {"model.safetensors": sha256(payload)}, "weights_version": 7})
+    )
+    (tmp_path / "model.safetensors").write_bytes(payload)
+    assert named(tmp_path / "model.safetensors", VIEW).weights.version == 7
+    (tmp_path / "model.safetensors").write_bytes(altered)
+    with pytest.raises(CheckpointError, match=r"model\.safetensors is damaged"):
+        named(tmp_path / "model.safetensors", VIEW)
+
+
+def test_json_of_another_program_beside_weights_says_nothing_about_them(
+    tmp_path: Path, payload: bytes
+) -> None:
+    (tmp_path / "some.safetensors").write_bytes(payload)
+    (tmp_path / "some.json").write_text('{"weights_version": 7}')
+    assert named(tmp_path / "some.safetensors", VIEW).weights.version == 0
 
 
 def test_missing_weights_are_refused(tmp_path: Path) -> None:
@@ -103,10 +121,14 @@ def test_weights_of_another_view_are_refused(tmp_path: Path, payload: bytes) -> 
         named(tmp_path / "some.safetensors")
 
 
-def test_a_runs_weights_play_in_its_own_arena(tmp_path: Path, payload: bytes) -> None:
+def test_a_runs_weights_play_in_its_own_arena(
+    tmp_path: Path, payload: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     own = load_config("smoke", {"arena.num_robots": "4", "arena.view_px": str(VIEW_PX)}, {})
     (tmp_path / "config.toml").write_text(to_toml(own))
     write_weights(tmp_path / "checkpoints" / "best.safetensors", payload, {})
     assert named(tmp_path).config.arena == own.arena
+    assert not caplog.messages
     assert named(tmp_path, "--robots", "2").config.arena.num_robots == 2
+    assert caplog.messages.pop().endswith("trained with 4 robots, plays with 2")
     assert named(tmp_path, "--config", "smoke", VIEW).config.arena.num_robots == 2
