@@ -23,7 +23,7 @@ from mrcdrl.common.config.schema import (
     kept_settings,
     sections,
 )
-from mrcdrl.common.config.toml import to_toml
+from mrcdrl.common.config.toml import from_toml, to_toml
 
 __all__ = [
     "DEFAULT_PRESET",
@@ -36,6 +36,7 @@ __all__ = [
     "RunConfig",
     "TransportConfig",
     "apply_overrides",
+    "from_toml",
     "kept_settings",
     "load_config",
     "load_transport",

@@ -8,7 +8,6 @@ import difflib
 import json
 import os
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import resources
@@ -18,11 +17,13 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from mrcdrl.common.config.schema import Config, TransportConfig, sections
+from mrcdrl.common.config.toml import from_toml
 from mrcdrl.common.errors import ConfigError
 
 DEFAULT_PRESET = "quick"  # of commands that get no --config
 ENV_PREFIX = "MRCDRL_"
 EXTENDS = "extends"
+_SHOWN = 200  # characters of a wrong value
 _TYPES = {
     "int": "must be a whole number",
     "float": "must be a number",
@@ -63,9 +64,9 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
                 f"config {source!r}: {reason}; give a file or a preset: {presets}"
             ) from error
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"config {source!r} is not TOML: {error}") from error
+        table = from_toml(text)
+    except ConfigError as error:
+        raise ConfigError(f"config {source!r} is {error}") from error
     base = table.pop(EXTENDS, None)
     _check_names(table, f"config {source!r}")
     if base is None:
@@ -96,8 +97,8 @@ def _check_names(table: Mapping[str, Any], where: str) -> None:
 def _parse_value(text: str) -> Any:
     """Parse a value of a flag or variable: as TOML if it is TOML, else as a plain string."""
     try:
-        table = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        table = from_toml(f"value = {text}")
+    except ConfigError:
         return text
     return table["value"] if len(table) == 1 else text
 
@@ -227,7 +228,9 @@ def _one_line(*above: str) -> Iterator[None]:
         path = (*above, *first["loc"])
         where = ".".join(map(str, path)) or "configuration"
         given = first.get("input")
-        shown = "" if isinstance(given, (dict, BaseModel)) else f" (given {given!r})"
+        text = repr(given)
+        text = f"{text[:_SHOWN]}…" if len(text) > _SHOWN else text
+        shown = "" if isinstance(given, (dict, BaseModel)) else f" (given {text})"
         raise ConfigError(f"{where}: {_requirement(path, first)}{shown}") from None
 
 

@@ -6,9 +6,16 @@ where that settles it ("ancestor"), and ours otherwise ("ours").
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Self, cast
+from typing import Annotated, Any, ClassVar, Literal, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 _FINEST_PX = 2.5  # arena px per image px; below, the literal renderer draws
 
@@ -39,6 +46,15 @@ class Section(BaseModel):
         frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False
     )
     kept: ClassVar[bool] = False  # whether a resumed run keeps all of its settings
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _check_flag(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse true and false for a number, which Python counts as 1 and 0."""
+        kind = cls.model_fields[str(info.field_name)].annotation
+        if isinstance(value, bool) and kind in (int, float):
+            raise ValueError("must be a number")
+        return value
 
 
 class ArenaConfig(Section):

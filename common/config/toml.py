@@ -1,9 +1,19 @@
-"""Writing a configuration as TOML."""
+"""Reading TOML from anyone, and writing a configuration as TOML."""
 
 import json
+import tomllib
 from typing import Any
 
 from mrcdrl.common.config.schema import Config
+from mrcdrl.common.errors import ConfigError
+
+
+def from_toml(text: str) -> dict[str, Any]:
+    """The table that a TOML text holds; raises ConfigError, with the reason, if it holds none."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # also of numbers too long, and too many brackets
+        raise ConfigError(f"not TOML: {error}") from error
 
 
 def to_toml(config: Config) -> str:

@@ -5,15 +5,27 @@ import os
 import re
 import socket
 import time
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
-from mrcdrl.common.config import Config, TransportConfig, apply_overrides, load_transport
+from mrcdrl.common.config import (
+    Config,
+    TransportConfig,
+    apply_overrides,
+    from_toml,
+    load_transport,
+    validate_config,
+)
 from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transport_flag, overrides
-from mrcdrl.common.errors import DeadlineError, UnreachableError, WireError
+from mrcdrl.common.errors import (
+    ConfigError,
+    DeadlineError,
+    RefusedError,
+    UnreachableError,
+    WireError,
+)
 from mrcdrl.common.runtime.names import check_name, printable
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.runs import add_run, is_run, run_path, unknown_run
@@ -89,22 +101,30 @@ def fetch_config(
 ) -> Config:
     """Ask replay for the run's configuration, and put this process's own settings over it.
 
-    Raises DeadlineError if nobody serves that run within the time, WireError if the answer is not
-    a configuration.
+    Raises, once the time is over, DeadlineError if nobody serves that run, WireError or
+    RefusedError if the answer is no configuration: another process may answer in replay's place.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)
     deadline = time.monotonic() + timeout_s
     while True:
         try:
-            answer = bytes(client.ask(b"").result())
-        except DeadlineError as error:
+            served = _served(bytes(client.ask(b"").result()), whom)
+        except (DeadlineError, RefusedError, WireError) as error:
             if time.monotonic() > deadline or stop.wait(0.2):
-                raise DeadlineError(f"{error}; is that the run's name?") from error
+                if isinstance(error, DeadlineError):
+                    raise DeadlineError(f"{error}; is that the run's name?") from error
+                raise
             continue
-        try:
-            served = tomllib.loads(answer.decode())
-        except ValueError as error:  # neither UTF-8 nor TOML
-            raise WireError(f"{whom} serves no configuration: {printable(str(error))}") from error
         table = {**served, "transport": joining.transport.model_dump()}
         return apply_overrides(table, joining.overrides)
+
+
+def _served(answer: bytes, whom: str) -> dict[str, Any]:
+    """The table of a served configuration; raises WireError if the answer is none."""
+    try:
+        served = from_toml(answer.decode())
+        validate_config(served)
+    except (UnicodeDecodeError, ConfigError) as error:
+        raise WireError(f"{whom} serves no configuration: {printable(str(error))}") from error
+    return served

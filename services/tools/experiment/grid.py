@@ -6,13 +6,12 @@ neither on the environment nor on the commit. All cells are checked before the f
 
 import itertools
 import json
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mrcdrl.common.config import Config, load_config, preset_names
+from mrcdrl.common.config import Config, from_toml, load_config, preset_names
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.files import sha256
 from mrcdrl.common.runtime.names import check_name
@@ -71,11 +70,13 @@ def read_grid(path: Path) -> list[Cell]:
     Raises ConfigError with one line for anything that is wrong.
     """
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
+        table = from_toml(path.read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"grid {str(path)!r}: {error.strerror}; give a TOML file") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ConfigError(f"grid {str(path)!r} is not TOML: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"grid {str(path)!r} is {error}") from error
     try:
         return list(_cells(table, path.parent))
     except ConfigError as error:

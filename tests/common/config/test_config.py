@@ -126,6 +126,15 @@ def test_a_file_that_is_no_toml_is_refused(write: Any, tmp_path: Path) -> None:
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     assert "can't decode" in refusal(str(tmp_path / "bytes.toml"))
     assert "Is a directory" in refusal(str(tmp_path))
+    assert "is not TOML" in refusal(write(f"[run]\nseed = {'[' * 3000}{']' * 3000}\n"))
+    assert "is not TOML" in refusal(write(f"[run]\nseed = {'9' * 5000}\n"))
+
+
+@pytest.mark.parametrize("text", ["[" * 3000 + "]" * 3000, "9" * 5000, "true"])
+def test_a_value_that_is_no_number_is_one_short_line(text: str) -> None:
+    said = refusal(None, {"run.seed": text})
+    assert said.startswith("run.seed: must be a")
+    assert len(said) < 300
 
 
 def test_a_file_extends_a_preset_field_by_field(write: Any) -> None:
