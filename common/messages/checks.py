@@ -34,6 +34,7 @@ from mrcdrl.common.runtime.names import MAX_NAME, is_name, printable
 
 Range = tuple[float, float]
 
+MAX_REPORT_BYTES = 1 << 16  # of Stats, EpisodeSummary and Evaluation: twice what the rest allows
 MAX_METRICS = 256  # of one service
 MAX_TEXTS = 32
 MAX_TEXT = 256  # characters

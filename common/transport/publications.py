@@ -13,6 +13,8 @@ import zenoh
 
 from mrcdrl.common.errors import TransportError
 
+_WAITING_BYTES = 1 << 24  # of publications that wait for their reader
+
 
 class Publisher:
     """Publishes bytes on one key."""
@@ -63,35 +65,45 @@ class LatestSubscriber:
 
 
 class QueueSubscriber:
-    """Publications in the order of their arrival, for one reading thread."""
+    """Publications in the order of their arrival, for one reading thread.
+
+    At most `capacity` wait, with no more bytes in all than 16 MiB, or than one of the largest size.
+    """
 
     def __init__(self, max_message_bytes: int, capacity: int) -> None:
         self._max_bytes = max_message_bytes
         self._waiting: queue.Queue[tuple[str, bytes]] = queue.Queue(capacity)
+        self._lock = threading.Lock()
+        self._bytes = 0
         self.dropped = 0
 
     def offer(self, sample: Any) -> None:
         """Zenoh's callback."""
-        try:
-            if len(sample.payload) > self._max_bytes:
-                raise queue.Full
+        size = len(sample.payload)
+        with self._lock:
+            most = max(self._max_bytes, _WAITING_BYTES)
+            full = self._waiting.full() or self._bytes + size > most
+            if full or size > self._max_bytes:
+                self.dropped += 1
+                return
+            self._bytes += size
             self._waiting.put_nowait((str(sample.key_expr), sample.payload.to_bytes()))
-        except queue.Full:
-            self.dropped += 1
 
     def take(self, timeout_s: float) -> tuple[str, bytes] | None:
         """The next (key, payload); None if none came within `timeout_s`."""
         try:
-            if timeout_s <= 0:
-                return self._waiting.get_nowait()
-            return self._waiting.get(timeout=timeout_s)
+            item = self._waiting.get(timeout_s > 0, timeout_s)
         except queue.Empty:
             return None
+        with self._lock:
+            self._bytes -= len(item[1])
+        return item
 
     def drain(self) -> Iterator[tuple[str, bytes]]:
-        """Yield everything now in the queue."""
-        while (item := self.take(0.0)) is not None:
-            yield item
+        """Yield what is now in the queue, and nothing that arrives meanwhile."""
+        for _ in range(self._waiting.qsize()):
+            if (item := self.take(0.0)) is not None:
+                yield item
 
 
 class Presence:
@@ -106,12 +118,9 @@ class Presence:
         self._changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
 
     def changes(self) -> Iterator[tuple[str, bool]]:
-        """Yield (key, alive) for each change since the last call, in order."""
-        while True:
-            try:
-                key, alive = self._changes.get_nowait()
-            except queue.Empty:
-                return
+        """Yield (key, alive) for each change from the last call until now, in order."""
+        for _ in range(self._changes.qsize()):
+            key, alive = self._changes.get_nowait()
             (self._alive.add if alive else self._alive.discard)(key)
             yield key, alive
 

@@ -185,9 +185,14 @@ class Session(Closing):
         self._declare(lambda on: on.declare_subscriber(key, handler))
         return latest
 
-    def queue_subscriber(self, key: str, capacity: int = 4096) -> QueueSubscriber:
-        """Subscriber that keeps publications in order; when full, it drops and counts new ones."""
-        waiting = QueueSubscriber(self._config.max_message_bytes, capacity)
+    def queue_subscriber(
+        self, key: str, capacity: int = 4096, max_message_bytes: int | None = None
+    ) -> QueueSubscriber:
+        """Subscriber that keeps publications in order; when full, it drops and counts new ones.
+
+        max_message_bytes: larger ones are dropped; None: as the configuration says.
+        """
+        waiting = QueueSubscriber(max_message_bytes or self._config.max_message_bytes, capacity)
         handler = zenoh.handlers.Callback(waiting.offer, indirect=False)
         self._declare(lambda on: on.declare_subscriber(key, handler))
         return waiting

@@ -7,8 +7,10 @@ from itertools import chain
 from typing import TypeVar
 
 from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.checks import MAX_REPORT_BYTES
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Stats
 from mrcdrl.common.messages.wire import decode_published
+from mrcdrl.common.runtime.names import is_name
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys, role_and_worker
 from mrcdrl.services.monitor.recorder import Recorder
@@ -17,7 +19,7 @@ from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.monitor.watching import Watching
 
 _LOG = logging.getLogger("train")
-M = TypeVar("M")
+M = TypeVar("M", Stats, EpisodeSummary, Evaluation)
 
 
 class Follower:
@@ -26,7 +28,8 @@ class Follower:
     recorder: writes them down, and knows the run's past; None to keep no record. lasted_s: seconds
     that the run had lasted, where there is no recorder to know it.
 
-    A message that cannot be folded in is left out, which is said once.
+    A message counts if its sender holds, or has held, a liveliness token, as every process of a run
+    does. One that cannot be folded in is left out, which is said once.
     """
 
     def __init__(
@@ -38,9 +41,10 @@ class Follower:
         rule: StoppingRule,
         lasted_s: float = 0.0,
     ) -> None:
-        self._stats = session.queue_subscriber(keys.every_stats)
-        self._episodes = session.queue_subscriber(keys.every_episode)
-        self._evaluations = session.queue_subscriber(keys.every_evaluation)
+        self._stats, self._episodes, self._evaluations = (
+            session.queue_subscriber(key, max_message_bytes=MAX_REPORT_BYTES)
+            for key in (keys.every_stats, keys.every_episode, keys.every_evaluation)
+        )
         self._presence = session.presence(keys.everyone())
         self._state = state
         self._recorder = recorder
@@ -67,24 +71,30 @@ class Follower:
         """Take in all that has arrived, waiting up to `timeout_s` for statistics; whether any
         arrived."""
         first = self._stats.take(timeout_s)
+        with self._watching("following who is up"):
+            for key, alive in self._presence.changes():
+                role, worker = role_and_worker(key)
+                if is_name(role) and is_name(worker):
+                    self._state.observe_presence(role, worker, alive)
         for item in chain([first] if first else [], self._stats.drain()):
             self._take(Stats, item, lambda s: self._state.observe_stats(s, self.now))
         for item in self._episodes.drain():
             self._take(EpisodeSummary, item, self._observe_episode)
         for item in self._evaluations.drain():
             self._take(Evaluation, item, self._observe_evaluation)
-        with self._watching("following who is up"):
-            for key, alive in self._presence.changes():
-                self._state.observe_presence(*role_and_worker(key), alive)
         if self._recorder and self.lived_s >= self._record_due_s:
             self._record_due_s = self.lived_s + 1.0
             self._recorder.record_metrics(self._state, self.now)
         return first is not None
 
-    def stop_reason(self) -> str | None:
-        """Why the run should end now, or None; minutes count from this start."""
+    def stop_reason(self, *, learner_ended: bool) -> str | None:
+        """Why the run should end now, or None; minutes count from this start.
+
+        learner_ended: whether the learner's process has. Steps that are only told end no run.
+        """
         state = self._state
-        return self._rule.reason(state.learner_steps, self.lived_s / 60, state.published)
+        steps = state.learner_steps if learner_ended else 0
+        return self._rule.reason(steps, self.lived_s / 60, state.published)
 
     def _observe_episode(self, episode: EpisodeSummary) -> None:
         self._state.observe_episode(episode)
@@ -98,9 +108,22 @@ class Follower:
         if self._recorder:
             self._recorder.record_evaluation(record)
 
+    def _check_sender(self, message: Stats | EpisodeSummary | Evaluation) -> None:
+        """Raise WireError if nobody who is, or was, up goes by the sender's name."""
+        match message:
+            case Stats(role, worker):
+                sender = (role, worker)
+            case EpisodeSummary():
+                sender = ("actor", message.actor)
+            case Evaluation():
+                sender = ("evaluator", message.worker)
+        if not self._state.knows(*sender):
+            raise WireError(f"{' '.join(sender)} holds no liveliness token")
+
     def _take(self, cls: type[M], item: tuple[str, bytes], observe: Callable[[M], None]) -> None:
         try:
             message = decode_published(cls, *item)
+            self._check_sender(message)
         except WireError as error:
             self._refused += 1
             if self._refused.bit_count() == 1:  # the 1st, 2nd, 4th …, as a peer may send many

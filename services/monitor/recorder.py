@@ -5,15 +5,18 @@ the operating system by the next `record_metrics` at the latest; a resumed run a
 be written once the files are open is said once and ends nothing.
 """
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.messages.checks import MAX_METRICS
+from mrcdrl.common.messages.metrics import SCHEMAS, kinds
 from mrcdrl.common.messages.trajectory import EpisodeSummary
 from mrcdrl.common.runtime.closing import Closing
 from mrcdrl.common.runtime.files import METRICS, atomic_write
@@ -38,6 +41,8 @@ from mrcdrl.services.monitor.watching import Watching
 SUMMARY = "summary.json"
 TENSORBOARD = "tensorboard"
 _RECORDING = "recording"  # as a failure is said
+_KNOWN = {role: kinds(schema) for role, schema in SCHEMAS.items()}
+_LARGEST_EVENT = float(np.finfo(np.float32).max)  # TensorBoard keeps float32; NaN is not below
 RATES = tuple(chain.from_iterable(COUNTERS.values()))
 EVALUATION_FIELDS = (
     "success_rate",
@@ -102,9 +107,9 @@ class Recorder(Closing):
             self._metrics.write(to_line(flat_metrics(state, now)))
         for name in RATES:
             self._event(f"rates/{name}_per_s", state.per_second(name, now), int(now))
-        for service in state.alive("learner"):
-            for name, value in service.metrics.items():
-                self._event(f"learner/{name}", value, state.learner_steps)
+        if (learner := state.learner) is not None:
+            for name in learner.metrics.keys() & _KNOWN["learner"].keys():
+                self._event(f"learner/{name}", learner.metrics[name], state.learner_steps)
         self.flush()
 
     def write_summary(self, state: RunState, now: float, stop_reason: str) -> None:
@@ -133,7 +138,7 @@ class Recorder(Closing):
                 events.close()
 
     def _event(self, tag: str, value: float, step: int) -> None:
-        if self._events is not None and math.isfinite(value):
+        if self._events is not None and abs(value) <= _LARGEST_EVENT:
             with self._watching(TENSORBOARD):
                 self._events.add(tag, value, step)
 
@@ -197,10 +202,15 @@ def _counted(metrics: Mapping[str, Any]) -> dict[tuple[str, str], float]:
 
 
 def _service_metrics(state: RunState) -> Iterator[tuple[str, float]]:
+    """Each service's metrics; of those in no schema a limited number, so that lines stay short."""
+    others = 0
     for service in state.services:
         if service.alive:
+            known = _KNOWN.get(service.role, {})
             for name, value in service.metrics.items():
-                yield f"{service.role}/{service.id}/{name}", value
+                others += name not in known
+                if name in known or others <= MAX_METRICS:
+                    yield f"{service.role}/{service.id}/{name}", value
     spreads = state.staleness_spreads
     for actor in state.alive("actor"):
         for unit, spread in spreads.get(actor.id, {}).items():

@@ -133,9 +133,15 @@ def read_last_metrics(run_dir: Path) -> dict[str, Any]:
     path = run_dir / METRICS
     if not path.exists():
         return {}
+    size = path.stat().st_size
+    tail, objects = _TAIL_BYTES, list[dict[str, Any]]()
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
-        objects = list(_objects(file.read()))
+        while not objects:  # a run of a thousand actors has lines of a megabyte
+            file.seek(max(0, size - tail))
+            objects = list(_objects(file.read()))
+            if tail >= size:
+                break
+            tail *= 4
     return objects[-1] if objects else {}
 
 

@@ -4,6 +4,7 @@ Invariants: pure, built from RunState and `now` alone; fills the console's rows 
 80 x 24; nothing scrolls. Curves are in braille: two points a column, four levels a row.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,8 +84,8 @@ class Rows:
 
 
 def clock(seconds: float | None) -> str:
-    """Time as 0:12:34; a dash for None."""
-    if seconds is None:
+    """Time as 0:12:34; a dash for None, and for no end in sight."""
+    if seconds is None or seconds == math.inf:
         return "–"
     whole = int(seconds)
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
@@ -169,7 +170,7 @@ def fill(state: RunState, width: int) -> Text:
     if ratio is not None:
         numbers += f" · {ratio:.2f} samples per insert"
     length = max(4, width - len("replay  ") - len(numbers) - 1)
-    done = round(length * min(1.0, size / capacity))
+    done = round(length * min(1.0, max(0.0, size / capacity)))
     line = Text(no_wrap=True).append("replay  ", style=ROLE_STYLES["replay"])
     line.append(BAR * done, style="blue").append(BAR * (length - done), style="grey23")
     return line.append(numbers)

@@ -214,6 +214,10 @@ class RunState:
 
     # -- services -----------------------------------------------------------------------
 
+    def knows(self, role: str, service_id: str) -> bool:
+        """Whether a service of that name is, or was, up."""
+        return (role, service_id) in self._services
+
     @property
     def services(self) -> list[Service]:
         """Every service ever seen, along the ring, then by id."""
@@ -221,6 +225,12 @@ class RunState:
         return sorted(
             self._services.values(), key=lambda s: (order.get(s.role, len(order)), s.role, s.id)
         )
+
+    @property
+    def learner(self) -> Service | None:
+        """The run's learner: of those that are up the one that came first; None without one."""
+        services = self._services.values()
+        return next((s for s in services if s.role == "learner" and s.alive), None)
 
     def alive(self, role: str) -> list[Service]:
         """The services of a role that are up, by id."""
@@ -231,10 +241,15 @@ class RunState:
         return [s.metrics[name] for s in self.alive(role) if name in s.metrics]
 
     def _known(self, role: str, name: str) -> float:
-        """Sum of a metric over a role's services that are up, else the value last reported."""
+        """Sum of a metric over a role's services that are up, else the value last reported.
+
+        A run has one learner, so that of others does not count.
+        """
         heard = [s for s in self._services.values() if s.role == role and name in s.metrics]
-        known = [s for s in heard if s.alive] or sorted(heard, key=lambda s: s.heard_s or 0.0)[-1:]
-        return sum(s.metrics[name] for s in known)
+        up = [s for s in heard if s.alive]
+        known = up[:1] if role == "learner" else up
+        latest = sorted(heard, key=lambda s: s.heard_s or 0.0)[-1:]
+        return sum(s.metrics[name] for s in known or latest)
 
     # -- counters and rates ---------------------------------------------------------------
 
@@ -283,10 +298,11 @@ class RunState:
 
     def staleness(self, actor: Service) -> tuple[int, float] | None:
         """Versions that an actor's weights are behind the learner's, and their age in seconds."""
-        learner = self.gauges("learner", "weights_version")
-        if not learner or "weights_version" not in actor.metrics:
+        learner = self.learner
+        published = {} if learner is None else learner.metrics
+        if "weights_version" not in published or "weights_version" not in actor.metrics:
             return None
-        behind = max(0, int(max(learner) - actor.metrics["weights_version"]))
+        behind = max(0, int(published["weights_version"] - actor.metrics["weights_version"]))
         return behind, actor.metrics.get("weights_age_s", 0.0)
 
     @property

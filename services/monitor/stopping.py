@@ -11,6 +11,7 @@ from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcom
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW
 
 _STOPPED = "stopped ("
+_EPOCHS = 16  # of evaluations that are kept; a run has one, and a peer may claim any
 
 
 def stopped(cause: str) -> str:
@@ -38,12 +39,12 @@ class StoppingRule:
         self._episodes = 0
         self._maximum = -1
         self._maximum_at = 0
-        self._reached: Evaluation | None = None
+        self._reached: dict[int, Evaluation] = {}  # the target, by epoch: the earliest of each
         self._goes_on = False  # although the target was reached
 
     def go_on(self) -> None:
         """What was reached so far ends the run no more: patience counts from here."""
-        self._goes_on = self._reached is not None
+        self._goes_on = bool(self._reached)
         if self._patience_is_over:
             self._maximum_at = self._episodes
 
@@ -55,22 +56,26 @@ class StoppingRule:
             self._maximum, self._maximum_at = successes, self._episodes
 
     def observe_evaluation(self, evaluation: Evaluation) -> None:
-        target, known = self._run.target_success_rate, self._reached
-        earliest = known is None or _order(evaluation) < _order(known)
+        target, epoch = self._run.target_success_rate, evaluation.weights_epoch
+        known = self._reached.get(epoch)
+        earliest = known is None or evaluation.weights_version < known.weights_version
         if target and evaluation.success_rate >= target and earliest:
-            self._reached = evaluation
+            self._reached[epoch] = evaluation
+            if len(self._reached) > _EPOCHS:
+                del self._reached[next(iter(self._reached))]
 
     def reason(
-        self, learner_steps: int, minutes: float, published: tuple[float, int]
+        self, learner_steps: int, minutes: float, published: tuple[float, int] | None
     ) -> str | None:
         """Why the run is over; None while it goes on.
 
-        published: epoch and version of the learner's last publication. An evaluation of later ones
-        does not belong to this run, or not yet.
+        published: epoch and version of the learner's last publication; None for all that have been
+        evaluated. An evaluation of later ones, or of another epoch, does not belong to this run.
         """
         run = self._run
-        reached = None if self._goes_on else self._reached
-        if reached is not None and _order(reached) <= published:
+        each = () if self._goes_on else self._reached.values()
+        reached = next((e for e in each if _belongs(e, published)), None)
+        if reached is not None:
             return (
                 f"evaluation success {reached.success_rate:.3f} reached "
                 f"run.target_success_rate {run.target_success_rate:g}"
@@ -98,6 +103,9 @@ class StoppingRule:
         return bool(patience) and satisfied and self._without_maximum >= patience
 
 
-def _order(evaluation: Evaluation) -> tuple[float, int]:
-    """The evaluated weights' place among all; the epoch as the learner's metrics have it."""
-    return float(evaluation.weights_epoch), evaluation.weights_version
+def _belongs(evaluation: Evaluation, published: tuple[float, int] | None) -> bool:
+    """Whether these weights are among those that the learner has published."""
+    if published is None:
+        return True
+    epoch, version = published
+    return float(evaluation.weights_epoch) == epoch and evaluation.weights_version <= version

@@ -124,7 +124,10 @@ def supervise(
                 for line in fleet.warnings(watching):
                     state.observe_log(line)
                 show()
-                reason = fleet.watch() or follower.stop_reason()
+                ended = fleet.watch()
+                if ended:
+                    follower.listen(_TICK_S)  # to the learner's last words
+                reason = follower.stop_reason(learner_ended=ended is not None) or ended
                 if stop.is_set():
                     reason = stopped(stop.cause)
             hurry.listen()

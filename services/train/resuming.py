@@ -1,6 +1,5 @@
 """Whether a run that is resumed has anything left to do; reads its records and writes nothing."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,7 +16,6 @@ _LIMITS = (
     "patience_episodes",
     "patience_floor",
 )
-_ALL_PUBLISHED = (math.inf, 0)  # every evaluation in the records was of weights of this run
 
 
 def check_unfinished(path: Path, before: Config, now: Config, given: Mapping[str, str]) -> None:
@@ -30,7 +28,7 @@ def check_unfinished(path: Path, before: Config, now: Config, given: Mapping[str
     restore(path, state, rule)
     if new_limit(before, now, given):
         rule.go_on()
-    reason = rule.reason(state.learner_steps, 0.0, _ALL_PUBLISHED)
+    reason = rule.reason(state.learner_steps, 0.0, published=None)
     if reason is not None:
         other = "--minutes 30"
         if 0 < now.run.learner_steps <= state.learner_steps:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from mrcdrl.common.config import Config, TransportConfig
 from mrcdrl.common.errors import EndpointError, TransportError, WireError
+from mrcdrl.common.messages.checks import MAX_REPORT_BYTES
 from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import decode_published
 from mrcdrl.common.runtime.process import StopSignal
@@ -50,7 +51,9 @@ def look(joining: Joining, stop: StopSignal) -> tuple[list[Finding], Config | No
         return [*found, failed("session", str(error), fix)], None
     with session:
         presence = session.presence(joining.keys.everyone())
-        heard = session.queue_subscriber(joining.keys.every_stats)
+        heard = session.queue_subscriber(
+            joining.keys.every_stats, max_message_bytes=MAX_REPORT_BYTES
+        )
         try:
             config = fetch_config(session, joining, stop, timeout_s=_REACH_S)
         except TransportError as error:
@@ -78,8 +81,9 @@ def listen(heard: QueueSubscriber, seconds: float) -> dict[str, tuple[Stats, flo
 
 
 def findings(last: Mapping[str, tuple[Stats, float]], presence: Presence) -> Iterator[Finding]:
-    """Check the services by their last statistics."""
+    """Check the services that are up by their last statistics."""
     alive = [role_and_worker(key) for key in presence.alive()]
+    last = {name: heard for name, heard in last.items() if (heard[0].role, name) in alive}
     yield services([role for role, _ in alive], [name for _, name in alive if name not in last])
     refused = {name: stats.metrics.get("weights_refused", 0.0) for name, (stats, _) in last.items()}
     yield weights(refused)

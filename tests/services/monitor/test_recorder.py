@@ -110,7 +110,7 @@ def test_the_stopping_rule_is_fed_with_the_past(tmp_path: Path) -> None:
     rule = StoppingRule(run)
     with Recorder(tmp_path, CONFIG) as recorder:
         recorder.restore(RunState(CONFIG), rule)
-    assert rule.reason(0, 0.0, (9.0, 9)) is not None
+    assert rule.reason(0, 0.0, (1.0, 20)) is not None
 
 
 def test_a_value_that_is_not_finite_is_strict_json(tmp_path: Path) -> None:
@@ -120,6 +120,32 @@ def test_a_value_that_is_not_finite_is_strict_json(tmp_path: Path) -> None:
         recorder.record_episode(episode(1, math.nan), state, 1.0)
     assert "NaN" not in (tmp_path / "episodes.jsonl").read_text()
     assert math.isnan(read_episodes(tmp_path)[0].episode.mean_q)
+
+
+def test_what_several_learners_claim_makes_neither_long_lines_nor_odd_events(
+    tmp_path: Path,
+) -> None:
+    """A run has one learner; what its metrics are is in a schema."""
+    state = RunState(CONFIG)
+    state.observe_stats(Stats("learner", "0", {"learner_steps": 5.0, "loss": 1e308}), 0.0)
+    for number in range(200):
+        many = {f"odd{metric}": 1.0 for metric in range(256)}
+        claim = Stats("learner", f"x{number}", many | {"learner_steps": 1e15})
+        state.observe_stats(claim, 0.0)
+    with Recorder(tmp_path, CONFIG) as recorder:
+        recorder.record_metrics(state, 1.0)
+    assert read_last_metrics(tmp_path)["learner_steps"] == 5
+    assert (tmp_path / "metrics.jsonl").stat().st_size < 1 << 16
+    (events,) = (tmp_path / "tensorboard").iterdir()
+    assert b"learner/learner_steps" in events.read_bytes()
+    assert b"learner/loss" not in events.read_bytes()  # no float32
+    assert b"odd" not in events.read_bytes()
+
+
+def test_the_last_line_of_metrics_is_found_however_long_it_is(tmp_path: Path) -> None:
+    long = json.dumps({"time_s": 2.0, "note": "x" * (3 << 20)})
+    (tmp_path / "metrics.jsonl").write_text(f'{{"time_s": 1.0}}\n{long}\n')
+    assert read_last_metrics(tmp_path)["time_s"] == 2.0
 
 
 def test_a_foreign_line_and_a_directory_that_cannot_be_written_are_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from mrcdrl.common.config import load_config
+from mrcdrl.common.config import RunConfig, load_config
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
 from mrcdrl.services.monitor.screen import Screen, braille_curve, plain_line, resample
 from mrcdrl.services.monitor.state import RunState
@@ -180,6 +180,18 @@ def test_the_age_of_an_actors_weights_is_shown(version: float, words: str) -> No
     metrics = {"weights_version": version, "weights_age_s": 1.0}
     state.observe_stats(Stats("actor", "actor-0", metrics), 11.0)
     assert words in "\n".join(rendered(state, 100, 32, 11.2))
+
+
+def test_whatever_a_peer_says_of_replay_and_speed_fits_the_screen() -> None:
+    config = CONFIG.model_copy(update={"run": RunConfig(learner_steps=100)})
+    state = RunState(config)
+    state.observe_stats(Stats("replay", "0", {"size": -1e9, "capacity": 1.0}), 0.0)
+    for second in (0.0, 1.0):  # a step in more seconds than a float64 holds
+        state.observe_stats(Stats("learner", "0", {"learner_steps": second * 5e-324}), second)
+    lines = rendered(state, 80, 24, 1.5)
+    assert max(map(len, lines)) <= 80
+    assert "– left" in lines[0]
+    assert len(plain_line(state, 1.5)) < 300
 
 
 def test_plain_line_is_one_line_with_the_same_figures() -> None:

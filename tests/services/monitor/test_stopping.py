@@ -102,6 +102,14 @@ def test_an_evaluation_of_weights_never_published_ends_no_run() -> None:
     assert "success 0.950 reached" in str(rule.reason(0, 0.0, (epoch, 7)))
 
 
+def test_evaluations_of_epochs_that_never_were_do_not_hide_a_real_one() -> None:
+    rule = StoppingRule(RunConfig(target_success_rate=0.9))
+    rule.observe_evaluation(evaluation(0.95, epoch=7, version=3))
+    for epoch in range(7):
+        rule.observe_evaluation(evaluation(1.0, epoch=epoch, version=0))
+    assert "success 0.950 reached" in str(rule.reason(0, 0.0, (7.0, 3)))
+
+
 def test_a_target_reached_before_a_resume_ends_the_run_no_more() -> None:
     rule = StoppingRule(RunConfig(target_success_rate=0.9))
     rule.observe_evaluation(evaluation(0.95))

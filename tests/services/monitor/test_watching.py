@@ -121,6 +121,8 @@ def test_a_message_that_cannot_be_folded_in_is_left_out_and_the_next_are_not(
     state, keys = Odd(CONFIG), Keys("odd")
     with Session(TransportConfig(listen=(free_endpoint(),))) as session:
         follower = Follower(session, keys, state, None, StoppingRule(CONFIG.run))
+        for actor in ("odd", "even"):
+            session.announce(keys.live("actor", actor))
         for actor in ("odd", "odd", "even"):
             stats = Stats("actor", actor, {"robot_steps": 5.0}, {})
             session.publisher(keys.stats("actor", actor)).put(encode(stats))
@@ -140,12 +142,13 @@ def test_one_odd_count_of_learner_steps_ends_nothing(steps: float, tmp_path: Pat
     ):
         follower = Follower(session, keys, state, recorder, rule)
         for learner, count in (("x1", steps), ("0", 7.0)):
+            session.announce(keys.live("learner", learner))
             stats = Stats("learner", learner, {"learner_steps": count, "weights_version": count})
             session.publisher(keys.stats("learner", learner)).put(encode(stats))
         while not state.learner_steps:
             follower.listen(0.05)
         assert "learner steps 7 " in plain_line(state, follower.now)
-        assert follower.stop_reason() is None
+        assert follower.stop_reason(learner_ended=True) is None
         recorder.record_metrics(state, follower.now)
     assert read_last_metrics(tmp_path)["learner_steps"] == 7
 

@@ -60,6 +60,7 @@ def test_statistics_are_received_and_count_as_work(tmp_path: Path) -> None:
         state = RunState(Config())
         follower = Follower(session, keys, state, None, StoppingRule(Config().run))
         born_s = follower.lived_s
+        session.announce(keys.live("actor", "a"))
         publisher = session.publisher(keys.stats("actor", "a"))
 
         def show() -> None:
