@@ -24,6 +24,7 @@ _LOG = logging.getLogger("weights")
 _POLL_S = 0.2
 _RETRY_S = 0.5
 _SILENCE_S = 20.0
+_AFTER_REFUSAL_S = 1.0
 
 
 class WeightsWriter:
@@ -93,7 +94,8 @@ class WeightsReader:
 
     adopt: puts weights into use, or raises CheckpointError if they are another network's; by
     default, all are taken. silence_s: after this long without newer weights the reader asks the
-    learner, because a link that was lost may come back without its subscriptions.
+    learner, because a link that was lost may come back without its subscriptions. It asks sooner
+    after a message that it refused, which may have taken the place of a good one.
     """
 
     def __init__(
@@ -108,7 +110,7 @@ class WeightsReader:
         self._client = session.client(keys.weights, "the learner", timeout_s=2.0)
         self._adopt = adopt
         self._silence_s = silence_s
-        self._heard_s = time.monotonic()
+        self._ask_at_s = time.monotonic() + silence_s
         self._asked: PendingReply | None = None
         self._order = (-1, -1)
         self._refused = 0
@@ -147,8 +149,8 @@ class WeightsReader:
     def _answer_after_silence(self) -> Part | None:
         """The answer to a question asked after a long silence, if it has come; asks when due."""
         if self._asked is None:
-            if time.monotonic() - self._heard_s >= self._silence_s:
-                self._heard_s = time.monotonic()
+            if time.monotonic() >= self._ask_at_s:
+                self._ask_at_s = time.monotonic() + self._silence_s
                 with contextlib.suppress(TransportError):  # asked again when due
                     self._asked = self._client.ask(b"")
             return None
@@ -178,11 +180,12 @@ class WeightsReader:
         except (WireError, CheckpointError) as error:
             self._refuse(error)
             return None
-        self._order, self._heard_s = weights.order, time.monotonic()
+        self._order, self._ask_at_s = weights.order, time.monotonic() + self._silence_s
         return weights
 
     def _refuse(self, error: Exception) -> None:
         """Count a message; log the 1st, 2nd, 4th, 8th …, as a peer may send many."""
         self._refused += 1
+        self._ask_at_s = min(self._ask_at_s, time.monotonic() + _AFTER_REFUSAL_S)
         if self._refused.bit_count() == 1:
             _LOG.warning("weights refused, %d so far: %s", self._refused, error)

@@ -13,6 +13,7 @@ from concurrent.futures import Executor
 from mrcdrl.common.arena import layout_symmetries
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.fitting import Fitting
 from mrcdrl.common.messages.trajectory import Samples
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.learner.accelerate.side_stream import on_side_stream
@@ -84,7 +85,8 @@ class Prefetcher:
                 batch = self._collate(samples)
             except WireError as error:
                 self.refused += 1
-                _LOG.warning("mini-batch refused: %s", error)
+                if self.refused.bit_count() == 1:  # the 1st, 2nd, 4th …, as a peer may send many
+                    _LOG.warning("mini-batch refused, %d so far: %s", self.refused, error)
                 continue
             except Exception as error:  # noqa: BLE001  raised again by next, in the owner's thread
                 self._error = error
@@ -104,11 +106,16 @@ class Prefetcher:
 def make_collate(
     config: Config, learner: Learner, rendering_threads: Executor | None = None
 ) -> Callable[[Samples], Batch]:
-    """A function from samples to the batch of one step, its images rendered by these threads."""
+    """A function from samples to the batch of one step, its images rendered by these threads.
+
+    It raises WireError for samples that do not fit the run.
+    """
+    fitting = Fitting(config)
     symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
     render = make_renderer(config.arena, learner.device, rendering_threads)
 
     def collated(samples: Samples) -> Batch:
+        fitting.check(samples)
         return collate(
             samples,
             render,

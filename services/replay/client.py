@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import math
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
@@ -9,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from mrcdrl.common.config import Config
-from mrcdrl.common.errors import DeadlineError, ThrottledError, WireError
+from mrcdrl.common.errors import DeadlineError, RefusedError, ThrottledError, WireError
 from mrcdrl.common.messages.framing import join_set
 from mrcdrl.common.messages.trajectory import (
     Chunk,
@@ -39,6 +40,7 @@ _LOG = logging.getLogger("replay-client")
 _RETRY_S = 0.2
 _LONGEST_RETRY_S = 3.2
 _LAST_ANSWER_S = 1.0  # wait for a pending answer after a stop
+_REFUSALS_S = 3.0  # a refusal repeated for so long is replay's, and no other process's in its place
 
 
 class ReplayWriter:
@@ -87,7 +89,7 @@ class ReplayWriter:
     def insert(self, chunks: Sequence[Chunk]) -> InsertReply | None:
         """Insert one chunk or more; the acknowledgement of all, or None when stopped before.
 
-        Raises RefusedError, with replay's reason, when asking again would not help.
+        Raises RefusedError, with replay's reason, when asking again did not help.
         """
         parts = join_set([encode_parts(chunk) for chunk in chunks])
         self._patience.renew()
@@ -108,6 +110,9 @@ class ReplayWriter:
                 if time.monotonic() - asked_s < _RETRY_S:  # too many requests are waiting
                     self._stop.wait(retry_s)
                     retry_s = min(2 * retry_s, _LONGEST_RETRY_S)
+            except RefusedError as error:
+                self._patience.refused(error)
+                self._stop.wait(_RETRY_S)
             except (DeadlineError, WireError):
                 self.unanswered += 1
                 self._patience.spend()
@@ -212,7 +217,8 @@ class ReplayReader:
     def sample(self) -> Samples | None:
         """The next mini-batch, valid until the next call; None when stopped before it came.
 
-        Raises RefusedError, with replay's reason, when asking again would not help.
+        Raises RefusedError, with replay's reason, when asking again did not help; WireError for
+        an answer that cannot be read, after which the next call asks again.
         """
         batch = next(self._batches, None)
         self._patience.renew()
@@ -234,6 +240,10 @@ class ReplayReader:
             samples = chosen.take()
         except ThrottledError:
             self._patience.renew()
+            return iter(())
+        except RefusedError as error:
+            self._patience.refused(error)
+            self._stop.wait(_RETRY_S)
             return iter(())
         except DeadlineError:
             self._patience.spend()
@@ -267,6 +277,7 @@ class PriorityWriter:
             session.client(keys.priorities(shard), name)
             for shard, name in enumerate(_names(num_shards))
         ]
+        self._patience = _Patience("replay has not taken priorities", math.inf)
         self._stop = stop
 
     @classmethod
@@ -276,7 +287,7 @@ class PriorityWriter:
     def update(self, priorities: Priorities) -> PrioritiesReply | None:
         """The acknowledgement; None if a shard is unreachable or busy, or when stopped.
 
-        Raises RefusedError, with replay's reason, when the message is wrong.
+        Raises RefusedError, with replay's reason, when messages are refused again and again.
         """
         pending = [client.ask(encode(part)) for client, part in self._parts(priorities)]
         replies = [self._reply(asked) for asked in pending]
@@ -298,9 +309,14 @@ class PriorityWriter:
         if not _answered(pending, self._stop):
             return None
         try:
-            return decode(PrioritiesReply, pending.result())
+            reply = decode(PrioritiesReply, pending.result())
         except (ThrottledError, DeadlineError, WireError):
             return None
+        except RefusedError as error:
+            self._patience.refused(error)
+            return None
+        self._patience.renew()
+        return reply
 
 
 def _names(num_shards: int) -> list[str]:
@@ -329,15 +345,30 @@ def _answered(pending: PendingReply, stop: StopSignal, last_s: float = 0.0) -> b
 
 
 class _Patience:
-    """Logs a warning for every `warn_s` without an answer."""
+    """Logs a warning for every `warn_s` without an answer, and bears a passing refusal.
+
+    Another process that answers in replay's place may refuse anything, so a refusal counts once
+    it has been repeated for a while.
+    """
 
     def __init__(self, what: str, warn_s: float) -> None:
         self._what = what
         self._warn_s = warn_s
         self.since = self._warned = time.monotonic()
+        self._refused_s: float | None = None  # since when all is refused
+
+    def refused(self, error: RefusedError) -> None:
+        """Raise the refusal if there have been only refusals for _REFUSALS_S."""
+        now = time.monotonic()
+        if self._refused_s is None:
+            self._refused_s = now
+            _LOG.warning("%s; asking again", error)
+        elif now - self._refused_s >= _REFUSALS_S:
+            raise error
 
     def renew(self) -> None:
         self.since = self._warned = time.monotonic()
+        self._refused_s = None
 
     def spend(self) -> None:
         now = time.monotonic()

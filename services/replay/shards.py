@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mrcdrl.common.errors import DeadlineError, ThrottledError
+from mrcdrl.common.errors import DeadlineError, ThrottledError, WireError
 from mrcdrl.common.messages.trajectory import Float64Array, Samples
 from mrcdrl.common.messages.wire import decode
 from mrcdrl.common.transport import Client, PendingReply
@@ -77,7 +77,7 @@ class ShardStream:
         """The answer that is ready; its arrays are valid until the next call, or `release`.
 
         Raises ThrottledError if the shard throttled it, DeadlineError if the shard is unreachable,
-        RefusedError with the shard's reason.
+        RefusedError with the shard's reason, WireError if the answer cannot be read.
         """
         self.release()
         pending = self._pending.popleft()
@@ -91,6 +91,9 @@ class ShardStream:
             self.late = True
             self._ask_at_s = time.monotonic() + _RETRY_S
             self._note(reachable=False)
+            raise
+        except WireError:
+            pending.release()
             raise
         self._taken, self._reply_bytes = pending, len(payload)
         self.total_priority, self.table_size = samples.total_priority, samples.table_size

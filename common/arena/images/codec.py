@@ -1,7 +1,8 @@
 """Observation records, and the images decoded from them.
 
 Invariants: both codecs give the same pixels for the same scene, because both render the scene
-rounded to float32. A record has a fixed number of bytes.
+rounded to float32. A record has a fixed number of bytes, and any bytes decode to an image: a peer
+may have sent them.
 """
 
 from itertools import accumulate
@@ -18,6 +19,7 @@ from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array
 
 _NUMBER = np.dtype("<f4")
 _SEED = np.dtype("<u4")
+_FARTHEST_PX = 1e5  # OpenCV takes no place much farther away
 
 
 class ObservationCodec(Protocol):
@@ -86,7 +88,10 @@ class SceneCodec:
         return images
 
     def _scene_of(self, numbers: Float32Array) -> Scene:
-        robots, targets, obstacles = np.split(numbers.astype(np.float64), self._ends)[:3]
+        with np.errstate(invalid="ignore"):
+            known = np.nan_to_num(numbers.astype(np.float64))
+        near = np.clip(known, -_FARTHEST_PX, _FARTHEST_PX)
+        robots, targets, obstacles = np.split(near, self._ends)[:3]
         return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2), obstacles.reshape(-1, 3))
 
 

@@ -258,3 +258,22 @@ def test_render_arena_uses_the_paper_colours() -> None:
     small = render_arena(scene, ArenaConfig(num_robots=1), 150, smooth=True)
     assert small.shape == (150, 150, 3)
     assert small[50, 25].tolist() == [255, 0, 0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 5.0])
+@pytest.mark.parametrize("renderer", ["analytic", "literal"])
+@given(st.data())
+@settings(max_examples=20)
+def test_any_bytes_of_a_record_decode_to_an_image(
+    renderer: str, noise: float, data: st.DataObject
+) -> None:
+    """A peer may have sent them, and the learner renders them."""
+    config = ArenaConfig.model_validate(
+        {"renderer": renderer, "pixel_noise": noise, "num_obstacles": 1, "view_px": 40}
+    )
+    codec = make_codec(config)
+    odd = st.sampled_from([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e19, 2**31, 1e5, 0.0, 1e-42])
+    count = codec.record_bytes // 4
+    numbers = data.draw(st.lists(odd | st.floats(width=32), min_size=count, max_size=count))
+    records = np.array(numbers, "<f4").view(np.uint8)
+    assert codec.decode(records).shape == (40, 40)

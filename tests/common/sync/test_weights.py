@@ -188,6 +188,23 @@ def test_a_reader_that_hears_only_what_it_refuses_asks_the_learner() -> None:
     assert found.order == (1, 1)
 
 
+def test_good_weights_whose_place_a_refused_message_took_are_asked_for_soon(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A subscriber keeps the newest message only, whoever sent it."""
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    wire = Wire()
+    reader, asked = reader_of(wire), []
+    for _ in range(30):
+        now += 0.1
+        wire.published, wire.answer = b"torn!", message_of(1, len(asked))
+        if reader.latest() is not None:
+            asked.append(now)
+    assert len(asked) >= 2
+    assert asked[0] < 1.5
+
+
 def test_many_refusals_are_few_lines(caplog: pytest.LogCaptureFixture) -> None:
     wire = Wire()
     reader = reader_of(wire)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from mrcdrl.common.errors import ThrottledError
+from mrcdrl.common.errors import RefusedError, ThrottledError
 from mrcdrl.common.messages.trajectory import InsertReply
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.process import StopSignal
@@ -19,8 +19,11 @@ from tests.services.replay.harness import LENGTH, make_chunk
 class FakeReplay:
     """Session, client and answer in one: throttles some requests at once, then acknowledges."""
 
-    def __init__(self, throttles: int, replies: Sequence[InsertReply] = ()) -> None:
+    def __init__(
+        self, throttles: int, replies: Sequence[InsertReply] = (), refusals: int = 0
+    ) -> None:
         self.throttles = throttles
+        self.refusals = refusals
         self.replies = iter(replies or itertools.repeat(InsertReply(0, False, 3)))
 
     def client(self, *_: object, **__: object) -> "FakeReplay":
@@ -36,6 +39,9 @@ class FakeReplay:
         self.throttles -= 1
         if self.throttles >= 0:
             raise ThrottledError("256 requests are waiting")
+        self.refusals -= 1
+        if self.refusals >= 0:
+            raise RefusedError("replay refused: no")
         return encode(next(self.replies))
 
     def release(self) -> None:
@@ -77,6 +83,24 @@ def test_a_writer_throttled_after_a_wait_asks_again_at_once(
     stop = Waits()
     assert insert(3, stop).throttled == 3
     assert stop.seconds == []
+
+
+@pytest.mark.parametrize("refusals", [1, 9, 10**9])
+def test_a_refusal_counts_once_it_has_been_repeated_for_a_while(
+    refusals: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Until then it may be of another process, which answers in replay's place."""
+    seconds = itertools.count(0, 0.1)
+    monkeypatch.setattr(client.time, "monotonic", lambda: next(seconds))
+    session = FakeReplay(0, refusals=refusals)
+    writer = ReplayWriter(session, Keys("run"), 10.0, Waits())  # type: ignore[arg-type]
+    with caplog.at_level(logging.WARNING, "replay-client"):
+        if refusals < 10**9:
+            assert writer.insert([make_chunk(0)]) is not None
+        else:
+            with pytest.raises(RefusedError, match="no"):
+                writer.insert([make_chunk(0)])
+    assert caplog.messages == ["replay refused: no; asking again"]
 
 
 @pytest.mark.parametrize(

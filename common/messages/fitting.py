@@ -1,0 +1,37 @@
+"""Whether samples fit the run whose configuration the learner has; docs/wire.md.
+
+Invariant: pure. Replay gives none that do not, but another process may answer in its place.
+"""
+
+import numpy as np
+
+from mrcdrl.common.config import Config
+from mrcdrl.common.config.returns import largest_n_step_return
+from mrcdrl.common.errors import WireError
+from mrcdrl.common.messages.trajectory import Samples
+
+
+class Fitting:
+    """What a run's configuration allows in a mini-batch."""
+
+    def __init__(self, config: Config) -> None:
+        window = config.arena.stack + config.agent.n_step
+        self._shape = (config.learner.batch_size, window, config.arena.record_bytes)
+        self._n_step = config.agent.n_step
+        self._largest_return = largest_n_step_return(config)
+
+    def check(self, samples: Samples) -> None:
+        """Raise WireError unless these samples are a mini-batch of the run."""
+        if samples.records.shape != self._shape:
+            raise WireError(
+                f"records {list(samples.records.shape)} where {list(self._shape)} are due: "
+                "another run?"
+            )
+        if int(samples.bootstrap_offsets.max()) > self._n_step:
+            raise WireError(f"a bootstrap offset exceeds agent.n_step, {self._n_step}")
+        largest = float(np.abs(samples.rewards).max())
+        if largest > self._largest_return:
+            raise WireError(
+                f"a return of {largest:g} where no arena of this run gives more than "
+                f"{self._largest_return:g}"
+            )
