@@ -1,6 +1,7 @@
 """`mrcdrl evaluator`: evaluate a run's live weights again and again, and keep the best."""
 
 import dataclasses
+import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,7 @@ from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.score import evaluation
 from mrcdrl.services.evaluator.trial import PolicyPlayer, play
 
+_LOG = logging.getLogger("evaluator")
 _POLL_S = 0.2
 _WORTH_CONFIRMING = 0.9  # success; below it, learning outruns luck
 _CONFIRMING_SEED = 500_000  # added to evaluator.seed: no test that is quoted has these starts
@@ -58,6 +60,7 @@ class Evaluator:
         self._publisher = session.publisher(keys.evaluation(worker))
         self._frames = 0  # each of many arenas
         self._evaluations = 0
+        self._failures = 0  # to keep the best weights
         self._version = -1
         self._busy = False
 
@@ -78,10 +81,19 @@ class Evaluator:
         if result is not None:
             self._evaluations += 1
             self._publisher.put(encode(result))
-            self._best.offer(weights, result)
+            self._keep(weights, result)
             if self._evaluations == 1:
                 self._after_first()
         self._busy = False
+
+    def _keep(self, weights: Weights, result: Evaluation) -> None:
+        """Keep the weights if they are the best; a full disk is no reason to stop evaluating."""
+        try:
+            self._best.offer(weights, result)
+        except CheckpointError as error:
+            self._failures += 1
+            if self._failures.bit_count() == 1:  # the 1st, 2nd, 4th …
+                _LOG.warning("%s (%d times so far)", error, self._failures)
 
     def _newest_after(self, until_s: float) -> Weights | None:
         """Wait until this time and for newer weights; return them, or None once stopped."""

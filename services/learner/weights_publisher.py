@@ -39,6 +39,7 @@ class WeightsPublisher:
         self.epoch, self.version = time.time_ns(), 0
         self._restore()
         self._reserved = 0
+        self._failures, self._saved_s = 0, 0.0  # attempts to save, and the time of the last one
         self.save()
 
     def _restore(self) -> None:
@@ -78,9 +79,16 @@ class WeightsPublisher:
         self._writer.publish(weights)
 
     def maybe_save(self) -> None:
-        """Save if the checkpoint period has passed."""
-        if time.monotonic() - self._saved_s >= self._settings.checkpoint_period_s:
+        """Save if the checkpoint period has passed; what cannot be written now is tried again."""
+        if time.monotonic() - self._saved_s < self._settings.checkpoint_period_s:
+            return
+        try:
             self.save()
+        except CheckpointError as error:
+            self._saved_s = time.monotonic()
+            self._failures += 1
+            if self._failures.bit_count() == 1:  # the 1st, 2nd, 4th …
+                _LOG.warning("%s (%d times so far); learning goes on", error, self._failures)
 
     def save(self) -> None:
         """Write a checkpoint now; raises CheckpointError where that fails."""

@@ -4,10 +4,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
 from mrcdrl.common.config import TransportConfig, load_config
+from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.metrics import EvaluatorMetrics, read
 from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights
 from mrcdrl.common.messages.wire import decode_published, encode
@@ -18,7 +20,7 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session, free_endpoint
-from mrcdrl.services.evaluator.evaluator import Evaluator
+from mrcdrl.services.evaluator.evaluator import BestWeights, Evaluator
 from tests.patience import PATIENCE_S
 
 SMALL = {
@@ -115,3 +117,26 @@ def test_refused_weights_are_told_and_do_not_block_good_ones(
         stop.set()
         thread.join()
     assert {epoch for epoch, _ in judged} == {1}
+
+
+def test_a_full_disk_under_the_best_weights_ends_no_evaluator(
+    session: Session,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    joining, stop = Joining("judged", "e", tmp_path, TransportConfig(), {}), StopSignal()
+    full = CheckpointError("weights best.safetensors not written: No space left on device")
+    monkeypatch.setattr(BestWeights, "offer", MagicMock(side_effect=full))
+    results = session.queue_subscriber(joining.keys.evaluation("e"))
+    publisher = session.publisher(joining.keys.weights)
+    thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
+    thread.start()
+    try:
+        for version in (1, 2):
+            publisher.put(weights(1, version))
+            eventually(lambda: results.take(0.1) is not None)
+    finally:
+        stop.set()
+        thread.join()
+    assert "No space left on device (1 times so far)" in caplog.text

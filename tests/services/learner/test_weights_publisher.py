@@ -1,5 +1,7 @@
 """Versions of weights rise over restarts, whatever the wall clock does meanwhile."""
 
+import errno
+import os
 import time
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -9,6 +11,7 @@ import pytest
 from mrcdrl.common.config import load_config
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.services.learner.checkpoint import load_latest
 from mrcdrl.services.learner.weights_publisher import WeightsPublisher
 from tests.services.learner.test_learner import make_learner, random_batch
 
@@ -50,6 +53,28 @@ def test_a_new_run_starts_from_its_initial_weights_and_a_resumed_one_does_not(
     resumed = make_learner()
     WeightsPublisher(config, resumed, writer, tmp_path / "checkpoints")
     assert resumed.payload() == learner.payload() != source.payload()
+
+
+def test_a_checkpoint_that_cannot_be_written_is_tried_again_while_learning_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = load_config("smoke", {"learner.checkpoint_period_s": "1e-9"}, environ={})
+    publisher = WeightsPublisher(config, make_learner(), MagicMock(), tmp_path)
+    saved = sorted(tmp_path.iterdir())
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", MagicMock(side_effect=OSError(errno.ENOSPC, "No space left")))
+        for _ in range(5):
+            publisher.maybe_save()
+            publisher.publish()
+        assert sorted(tmp_path.iterdir()) == saved
+    assert [r.getMessage().partition("not written: ")[2] for r in caplog.records] == [
+        f"No space left ({count} times so far); learning goes on" for count in (1, 2, 4)
+    ]
+    before = publisher.version
+    publisher.maybe_save()
+    loaded = load_latest(tmp_path)
+    assert loaded is not None
+    assert loaded.checkpoint.weights_version > before + 1000
 
 
 @pytest.mark.parametrize("content", [None, b"text"])
