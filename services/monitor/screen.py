@@ -4,7 +4,6 @@ Invariants: pure, built from RunState and `now` alone; fills the console's rows 
 80 x 24; nothing scrolls. Curves are in braille: two points a column, four levels a row.
 """
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
