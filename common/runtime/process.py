@@ -46,23 +46,27 @@ class StopSignal:
         self.cause = ""  # the signal that set it, as a user knows it
         self._event = threading.Event()
         self._deadline_s = 0
+        self._then: StopSignal | None = None
 
-    def listen(self, deadline_s: int = 0) -> "StopSignal":
+    def listen(self, deadline_s: int = 0, then: "StopSignal | None" = None) -> "StopSignal":
         """Have SIGTERM, SIGINT and SIGHUP set it; call from the main thread.
 
         A SIGHUP that is ignored stays ignored: nohup starts what outlives its terminal.
 
         deadline_s: if above 0, the kernel ends a process that still runs this long after the
-        signal, whatever it waits for.
+        signal, whatever it waits for. then: is set by the next signal, however soon it comes.
         """
-        self._deadline_s = deadline_s
+        self._deadline_s, self._then = deadline_s, then
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             signal.signal(signal.SIGHUP, self._on_signal)
         return self
 
-    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._then is not None and self.is_set():
+            self._then._on_signal(number, frame)
+            return
         self.cause = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
         self._event.set()
         signal.alarm(self._deadline_s)

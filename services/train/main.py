@@ -14,7 +14,8 @@ _LOG = logging.getLogger("train")
 def main(argv: Sequence[str]) -> int:
     """Train; the exit code."""
     with open_run(argv) as run:
-        stop, hurry = StopSignal().listen(), StopSignal()
+        hurry = StopSignal()
+        stop = StopSignal().listen(then=hurry)
         prefix = "resuming " if run.resumed else ""
         _LOG.info("%srun %s: %s", prefix, run.path, expectation(run.config))
         fleet = Fleet(run.logs)

@@ -77,6 +77,23 @@ def test_a_command_starts_with_its_output_closed(closed: str) -> None:
     assert result.stderr == b""
 
 
+TWICE = """
+import signal
+from mrcdrl.common.runtime.process import StopSignal
+
+hurry = StopSignal()
+stop = StopSignal().listen(then=hurry)
+for number in (signal.SIGTERM, signal.SIGINT):
+    signal.raise_signal(number)
+    print(stop.cause, hurry.cause or "-", hurry.is_set())
+"""
+
+
+def test_a_second_signal_hurries_however_soon_it_comes() -> None:
+    told = subprocess.run([sys.executable, "-c", TWICE], capture_output=True, text=True, check=True)
+    assert told.stdout == "SIGTERM - False\nSIGTERM Ctrl-C True\n"
+
+
 YIELDS = """
 import os
 from pathlib import Path
