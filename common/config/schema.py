@@ -4,6 +4,7 @@ A default is the paper's where the paper gives one ("paper"), that of the game i
 where that settles it ("ancestor"), and ours otherwise ("ours").
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self, cast
@@ -17,6 +18,7 @@ from pydantic import (
     model_validator,
 )
 
+_NO_PATH = re.compile(r"[\x00\ud800-\udfff]")  # NUL, and bytes that are no UTF-8
 _FINEST_PX = 2.5  # arena px per image px; below, the literal renderer draws
 
 _LONGEST_S = 1e9  # thirty years; the system's waits overflow beyond nine times that
@@ -49,11 +51,13 @@ class Section(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _check_flag(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse true and false for a number, which Python counts as 1 and 0."""
+    def _check_given(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse true and false for a number, which Python counts as 1 and 0, and odd text."""
         kind = cls.model_fields[str(info.field_name)].annotation
         if isinstance(value, bool) and kind in (int, float):
             raise ValueError("must be a number")
+        if kind is str and isinstance(value, str) and _NO_PATH.search(value):
+            raise ValueError("must be text in UTF-8, without NUL")
         return value
 
 

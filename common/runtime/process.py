@@ -1,8 +1,8 @@
 """The shell that all commands share: signals, logging, and a clean exit.
 
 Invariants: SIGTERM, SIGINT and SIGHUP set one StopSignal; errors raised on purpose end the process
-with one line and their exit code; bugs crash with a traceback. Output that nobody reads any more,
-or characters that the locale lacks, are no bugs.
+with one line and their exit code, and so do files that cannot be used; bugs crash with a traceback.
+Output that nobody reads any more, or characters that the locale lacks, are no bugs.
 """
 
 import contextlib
@@ -117,7 +117,7 @@ def _exit_code(main: Callable[[], int | None]) -> int:
             return CLOSED_PIPE
         raise
     except OSError as error:
-        if error.errno == errno.ENOSPC:
+        if error.errno == errno.ENOSPC or error.filename is not None:
             _say(str(error))
             return 1
         if isinstance(error, BrokenPipeError):

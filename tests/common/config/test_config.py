@@ -130,6 +130,13 @@ def test_a_file_that_is_no_toml_is_refused(write: Any, tmp_path: Path) -> None:
     assert "is not TOML" in refusal(write(f"[run]\nseed = {'9' * 5000}\n"))
 
 
+@pytest.mark.parametrize("path", ["/tmp/\udcff", "a\x00b"])
+def test_a_path_that_no_file_of_settings_holds_is_refused(path: str) -> None:
+    said = refusal(None, {"learner.initial_weights": path})
+    assert said.startswith("learner.initial_weights: must be text in UTF-8")
+    assert said.isprintable()
+
+
 @pytest.mark.parametrize("text", ["[" * 3000 + "]" * 3000, "9" * 5000, "true"])
 def test_a_value_that_is_no_number_is_one_short_line(text: str) -> None:
     said = refusal(None, {"run.seed": text})
@@ -351,7 +358,9 @@ def test_every_preset_loads_and_reads_back_from_its_toml(name: str, write: Any) 
     assert list(tomllib.loads(to_toml(config))) == list(sections())
 
 
-@given(device=st.text(st.characters(codec="utf-8")), points=st.floats(0, 1))
+@given(
+    device=st.text(st.characters(codec="utf-8", exclude_characters="\0")), points=st.floats(0, 1)
+)
 def test_any_text_and_number_reads_back_from_toml(device: str, points: float) -> None:
     config = Config.model_validate(
         {

@@ -77,6 +77,16 @@ def test_a_command_starts_with_its_output_closed(closed: str) -> None:
     assert result.stderr == b""
 
 
+def test_a_file_that_cannot_be_used_is_one_line(tmp_path: Path) -> None:
+    says = "from pathlib import Path; from mrcdrl.common.runtime.process import run_main; "
+    says += f"raise SystemExit(run_main(lambda: Path({str(tmp_path)!r}).read_bytes() and 0))"
+    result = subprocess.run(
+        [sys.executable, "-c", says], capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 1
+    assert result.stderr == f"mrcdrl: [Errno 21] Is a directory: {str(tmp_path)!r}\n"
+
+
 TWICE = """
 import signal
 from mrcdrl.common.runtime.process import StopSignal
