@@ -4,10 +4,14 @@ Invariants: a file gets its name only when its bytes are on the disk; a write th
 killed leaves nothing under the final name.
 """
 
+import errno
 import fcntl
 import hashlib
 import os
+import tempfile
 from pathlib import Path
+
+from mrcdrl.common.errors import ConfigError
 
 TEMPORARY_SUFFIX = ".part"
 WEIGHTS_SUFFIX = ".safetensors"
@@ -68,6 +72,23 @@ def lock_directory(path: Path) -> int:
         os.close(descriptor)
         raise
     return descriptor
+
+
+def prepare_output(path: Path) -> None:
+    """Make the folder of a file that a command is to write, before its work begins.
+
+    Raises ConfigError if the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {reason(error)}") from error
 
 
 def sha256(content: bytes) -> str:

@@ -41,6 +41,11 @@ def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[
             yield Moment(number, frame, scene, views, ending)
 
 
+def num_film_frames(episodes: Sequence[EpisodeResult]) -> int:
+    """The number of images that `film_frames` yields."""
+    return sum(len(episode.robots) - 1 + _ENDING_FRAMES for episode in episodes)
+
+
 def film_frames(
     config: ArenaConfig, episodes: Sequence[EpisodeResult], note: str = ""
 ) -> Iterator[UInt8Array]:

@@ -4,13 +4,11 @@ With --failures, failed episodes are replayed after the test, whose own numbers 
 """
 
 import dataclasses
+import itertools
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-
-from rich.console import Console
-from rich.progress import Progress
+from collections.abc import Sequence
 
 from mrcdrl.common.arena import test_starts
 from mrcdrl.common.config.arguments import whole_number
@@ -20,8 +18,15 @@ from mrcdrl.services.evaluator.score import evaluation
 from mrcdrl.services.evaluator.trial import EpisodeResult, play
 from mrcdrl.services.tools.failure_summary import as_json, failure_table, summarize
 from mrcdrl.services.tools.failures import Failure
+from mrcdrl.services.tools.progress import Done, Progress
 from mrcdrl.services.tools.replays import failures_of, num_replays
-from mrcdrl.services.tools.subject import Subject, parse_with_episodes, subject, subject_parser
+from mrcdrl.services.tools.subject import (
+    Subject,
+    always,
+    parse_with_episodes,
+    subject,
+    subject_parser,
+)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -38,21 +43,20 @@ def main(argv: Sequence[str]) -> int:
     )
     arguments = parse_with_episodes(parser, argv, 1100)
     evaluated = subject(arguments)
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("episodes", total=arguments.episodes)
+    with Progress() as progress:
         result, measures, episodes = evaluate(
             evaluated,
             arguments.episodes,
             arguments.seed,
-            lambda done: progress.update(task, completed=done),
+            progress.stage("episodes", arguments.episodes),
             keep_failed_paths=arguments.failures is not None,
         )
         failures: list[Failure] = []
         if arguments.failures is not None:
-            task = progress.add_task("replays of failures", total=num_replays(episodes))
+            done = progress.stage("replays of failures", num_replays(episodes))
+            replayed = itertools.count(1)
             failures = failures_of(
-                evaluated, episodes, arguments.seed, lambda: progress.advance(task)
+                evaluated, episodes, arguments.seed, lambda: done(next(replayed))
             )
     told = dataclasses.asdict(result) | {"navigation": dataclasses.asdict(measures)}
     text = table(result, evaluated) + navigation_table(measures)
@@ -68,7 +72,7 @@ def evaluate(
     evaluated: Subject,
     episodes: int,
     seed: int,
-    report: Callable[[int], None],
+    report: Done,
     *,
     keep_failed_paths: bool = False,
 ) -> tuple[Evaluation, Navigation, list[EpisodeResult]]:
@@ -79,10 +83,6 @@ def evaluate(
     began_s = time.monotonic()
     starts = test_starts(evaluated.config.arena, episodes, seed)
 
-    def keep_going(done: int) -> bool:
-        report(done)
-        return True
-
     player = evaluated.player(seed)
     results = (
         play(
@@ -90,7 +90,7 @@ def evaluate(
             starts,
             player,
             keep_failed_paths=keep_failed_paths,
-            keep_going=keep_going,
+            keep_going=always(report),
         )
         or []
     )

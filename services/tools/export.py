@@ -21,7 +21,8 @@ from mrcdrl.common.errors import CheckpointError, ConfigError
 from mrcdrl.common.model.policy import FrameStack, Policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import network_from_bytes
-from mrcdrl.common.runtime.files import atomic_write, reason
+from mrcdrl.common.runtime.files import atomic_write, prepare_output, reason
+from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.subject import Subject, subject, subject_parser
 
 NAMES = ("observation", "q_values")  # uint8 [B, S, V, V], float32 [B, A]
@@ -41,13 +42,15 @@ def main(argv: Sequence[str]) -> int:
     if arguments.out.suffix not in FORMATS:
         extension = arguments.out.suffix
         raise ConfigError(f"--out: unsupported extension {extension!r}; use {suffixes}")
+    prepare_output(arguments.out)
     given = subject(arguments)
-    difference = export(given, arguments.out)
+    with Progress() as progress:
+        difference = export(given, arguments.out, progress)
     print(f"{arguments.out}: {_STATES} states, largest difference from torch {difference:.2g}")
     return 0
 
 
-def export(given: Subject, out: Path) -> float:
+def export(given: Subject, out: Path, progress: Progress) -> float:
     """Write the weights in the suffix's format; return the largest difference in values.
 
     Raises ConfigError for a controller, missing packages or a file that cannot be written, and
@@ -64,10 +67,13 @@ def export(given: Subject, out: Path) -> float:
         "weights_version": given.weights.version,
         "learner_step": given.weights.learner_step,
     }
+    progress.stage("states of real episodes")
     states = torch.from_numpy(real_states(given.config, given.policy, _STATES))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns about its own internals
+        progress.stage(out.name)
         content = pack(network, states[:2], json.dumps(metadata))
+        progress.stage("comparing its values with the network's")
         difference = _difference(network, unpack(content), states)
     try:
         atomic_write(out, content)

@@ -17,6 +17,7 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
+from mrcdrl.common.runtime.files import prepare_output
 from mrcdrl.common.runtime.runs import find_run, find_weights
 from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import Path2D, check_suffix, trajectories
@@ -29,6 +30,7 @@ from mrcdrl.services.plots.paper import (
     curves,
     sight,
 )
+from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.subject import (
     Subject,
     add_arena_flags,
@@ -51,7 +53,10 @@ def main(argv: Sequence[str]) -> int:
     """Write the figure; return the exit code."""
     arguments = _parser().parse_args(argv)
     check_suffix(arguments.out, SUFFIXES)
-    _FIGURES[arguments.figure](arguments)
+    prepare_output(arguments.out)
+    with Progress() as progress:
+        _FIGURES[arguments.figure](arguments, progress)
+    print(arguments.out)
     return 0
 
 
@@ -81,7 +86,7 @@ def _parser() -> Parser:
     return parser
 
 
-def _arena(arguments: argparse.Namespace) -> None:
+def _arena(arguments: argparse.Namespace, _progress: Progress) -> None:
     """Draw a test start in the arena of each subject, or of --config if there is none."""
     named = [shown.config for shown in _subjects(arguments)]
     configs = [config.arena for config in named or [config_without_weights(arguments)]]
@@ -95,11 +100,11 @@ def _arena(arguments: argparse.Namespace) -> None:
     arenas(images, titles, arguments.out, obstacles=obstacles)
 
 
-def _views(arguments: argparse.Namespace) -> None:
+def _views(arguments: argparse.Namespace, progress: Progress) -> None:
     """Show what the lowermost robot sees (Fig. 3)."""
     shown = _one(arguments)
     config = shown.config.arena
-    (episode,) = shown.episodes(1, arguments.seed)
+    (episode,) = shown.episodes(1, arguments.seed, progress.stage("the episode"))
     frame = min(arguments.frame, episode.frames)
     before = range(frame - config.stack + 1, frame + 1)
     targets, obstacles = episode.targets, episode.obstacles
@@ -116,13 +121,15 @@ def _views(arguments: argparse.Namespace) -> None:
     sight(seen, config, arguments.out)
 
 
-def _trajectories(arguments: argparse.Namespace) -> None:
+def _trajectories(arguments: argparse.Namespace, progress: Progress) -> None:
     shown = _one(arguments)
-    episodes = shown.episodes(arguments.episodes or 12, arguments.seed)
+    num = arguments.episodes or 12
+    episodes = shown.episodes(num, arguments.seed, progress.stage("episodes", num))
+    progress.stage(arguments.out.name)
     trajectories(_paths(episodes), shown.config.arena, arguments.out)
 
 
-def _comparison(arguments: argparse.Namespace) -> None:
+def _comparison(arguments: argparse.Namespace, progress: Progress) -> None:
     """Compare policies; raise ConfigError, naming the field, if their arenas differ."""
     subjects = _subjects(arguments)
     if len(subjects) < 2:
@@ -132,22 +139,25 @@ def _comparison(arguments: argparse.Namespace) -> None:
         for name in _WORLD:
             if getattr(other.config.arena, name) != getattr(world, name):
                 raise ConfigError(f"different arenas: arena.{name} differs; set it by its flag")
+    num = arguments.episodes or 4
     rows = []
     for name, shown in zip(_names(arguments), subjects, strict=True):
-        episodes = shown.episodes(arguments.episodes or 4, arguments.seed)
+        done = progress.stage(f"episodes of {name}", num)
+        episodes = shown.episodes(num, arguments.seed, done)
         won = sum(episode.outcome is Outcome.SUCCESS for episode in episodes)
         rows.append(Contender(f"{name}: {won} of {len(episodes)}", _paths(episodes)))
+    progress.stage(arguments.out.name)
     comparison(rows, world, arguments.out)
 
 
-def _curves(arguments: argparse.Namespace) -> None:
+def _curves(arguments: argparse.Namespace, _progress: Progress) -> None:
     """Plot the records of runs; no episode is played."""
     if not arguments.weights or arguments.controller:
         raise ConfigError("curves takes run directories only")
     curves([find_run(run, arguments.run_dir) for run in arguments.weights], arguments.out)
 
 
-_FIGURES: dict[str, Callable[[argparse.Namespace], None]] = {
+_FIGURES: dict[str, Callable[[argparse.Namespace, Progress], None]] = {
     "arena": _arena,
     "views": _views,
     "trajectories": _trajectories,

@@ -3,9 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.messages.trajectory import Outcome
+from mrcdrl.common.runtime.files import prepare_output
+from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import check_suffix
 from mrcdrl.services.plots.film import SUFFIXES, write_film
-from mrcdrl.services.tools.episode_frames import film_frames
+from mrcdrl.services.tools.episode_frames import film_frames, num_film_frames
+from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.rerun_recording import SUFFIX, check_rerun, write_recording
 from mrcdrl.services.tools.subject import parse_with_episodes, subject, subject_parser
 
@@ -20,14 +25,36 @@ def main(argv: Sequence[str]) -> int:
     )
     arguments = parse_with_episodes(parser, argv, 4)
     check_suffix(arguments.out, (*SUFFIXES, SUFFIX))
+    prepare_output(arguments.out)
     recorded = arguments.out.suffix == SUFFIX
     if recorded:
         check_rerun()
     shown = subject(arguments)
     arena = shown.config.arena
-    results = shown.episodes(arguments.episodes, arguments.seed)
-    if recorded:
-        write_recording(arguments.out, arena, results)
-    else:
-        write_film(arguments.out, film_frames(arena, results), FPS)
+    with Progress() as progress:
+        done = progress.stage("episodes", arguments.episodes)
+        results = shown.episodes(arguments.episodes, arguments.seed, done)
+        if recorded:
+            progress.stage("recording")
+            write_recording(arguments.out, arena, results)
+        else:
+            write_episodes(arguments.out, arena, results, progress)
+    won = sum(result.outcome is Outcome.SUCCESS for result in results)
+    print(f"{arguments.out}: {len(results)} episodes, {won} successes")
     return 0
+
+
+def write_episodes(
+    out: Path,
+    arena: ArenaConfig,
+    results: Sequence[EpisodeResult],
+    progress: Progress,
+    note: str = "",
+) -> None:
+    """Film episodes whose paths were kept; raises MrcdrlError as `write_film` does.
+
+    note: which episodes these are.
+    """
+    images = film_frames(arena, results, note)
+    frames = progress.over(images, out.name, num_film_frames(results))
+    write_film(out, frames, FPS)

@@ -6,10 +6,9 @@ from pathlib import Path
 from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.runtime.runs import add_run, find_run
 from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
-from mrcdrl.services.plots.film import write_film
 from mrcdrl.services.plots.paper import SUFFIXES
-from mrcdrl.services.tools.episode_frames import film_frames
-from mrcdrl.services.tools.render import FPS
+from mrcdrl.services.tools.progress import Progress
+from mrcdrl.services.tools.render import write_episodes
 from mrcdrl.services.tools.subject import subject, subject_parser
 
 _EPISODES = 12
@@ -23,20 +22,27 @@ def main(argv: Sequence[str]) -> int:
     add_run(parser)
     arguments = parser.parse_args(argv)
     run_dir = find_run(arguments.run, arguments.run_dir)
-    training_curve(run_dir, *plots(run_dir, "training"))
-    draw_episodes(run_dir)
+    files = plots(run_dir, "training")
+    with Progress() as progress:
+        progress.stage("training.png")
+        training_curve(run_dir, *files)
+        print(*files, sep="\n")
+        draw_episodes(run_dir, progress)
     return 0
 
 
-def draw_episodes(run_dir: Path) -> None:
+def draw_episodes(run_dir: Path, progress: Progress) -> None:
     """Plot and film episodes of the best weights; CheckpointError if the run has no weights."""
     shown = subject(subject_parser("report", "").parse_args([str(run_dir)]))
     arena = shown.config.arena
-    results = shown.episodes(_EPISODES, _SEED)
+    results = shown.episodes(_EPISODES, _SEED, progress.stage("episodes", _EPISODES))
     paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]
-    trajectories(paths, arena, *plots(run_dir, "trajectories"))
-    note = f"the first {_FILMED} of {_EPISODES} episodes"
-    write_film(run_dir / "evaluation.mp4", film_frames(arena, results[:_FILMED], note), FPS)
+    files = plots(run_dir, "trajectories")
+    progress.stage("trajectories.png")
+    trajectories(paths, arena, *files)
+    film, note = run_dir / "evaluation.mp4", f"the first {_FILMED} of {_EPISODES} episodes"
+    write_episodes(film, arena, results[:_FILMED], progress, note)
+    print(*files, film, sep="\n")
 
 
 def plots(run_dir: Path, name: str) -> list[Path]:

@@ -2,7 +2,7 @@
 
 import argparse
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from mrcdrl.services.evaluator.trial import (
     PolicyPlayer,
     play,
 )
+from mrcdrl.services.tools.progress import Done
 
 _LOG = logging.getLogger("mrcdrl")
 
@@ -50,10 +51,17 @@ class Subject:
         name = self.controller or ""
         return ControllerPlayer(lambda: make_controller(name, arena, rng), epsilon, rng)
 
-    def episodes(self, num: int, seed: int) -> list[EpisodeResult]:
-        """Play the paper's test from `num` starts, keeping the robots' paths."""
+    def episodes(self, num: int, seed: int, report: Done) -> list[EpisodeResult]:
+        """Play the paper's test from `num` starts, keeping the robots' paths.
+
+        report: called with the number of episodes finished.
+        """
         starts = test_starts(self.config.arena, num, seed)
-        return play(self.config.arena, starts, self.player(seed), keep_paths=True) or []
+        player = self.player(seed)
+        return (
+            play(self.config.arena, starts, player, keep_paths=True, keep_going=always(report))
+            or []
+        )
 
 
 def subject_parser(command: str, description: str) -> Parser:
@@ -117,6 +125,16 @@ def _say_other_robots(path: Path, own: str, config: Config) -> None:
     learned, now = load_config(own, environ={}).arena.num_robots, config.arena.num_robots
     if learned != now:
         _LOG.warning("%s: trained with %d robots, plays with %d", path, learned, now)
+
+
+def always(report: Done) -> Callable[[int], bool]:
+    """A `keep_going` of `play` that reports, and goes on."""
+
+    def keep_going(done: int) -> bool:
+        report(done)
+        return True
+
+    return keep_going
 
 
 def controlled(name: str, config: Config) -> Subject:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from mrcdrl.common.config import Config, load_config
 from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
-from mrcdrl.common.runtime.files import RUN_CONFIG
+from mrcdrl.common.runtime.files import RUN_CONFIG, prepare_output
 from mrcdrl.common.runtime.runs import add_run, find_run
 from mrcdrl.services.replay.inspect.contents import log_directory, read_contents
 from mrcdrl.services.replay.inspect.export import write_export
@@ -34,17 +34,21 @@ def main(argv: Sequence[str]) -> int:
     add_config_flags(parser)
     arguments = parser.parse_args(argv)
     run = find_run(arguments.run, arguments.run_dir)
+    if arguments.export is not None:
+        prepare_output(arguments.export)
     directory = log_directory(run, arguments.shard)
     config = _config(run, arguments.config, overrides(arguments))
     contents = read_contents(directory, config, records=arguments.export is not None)
     found = {"log": str(directory), **summarize(contents)}
-    if arguments.json:
-        print(json.dumps(found))
-    else:
-        show(found, Console(file=sys.stdout))
     if arguments.export is not None:
         count = write_export(arguments.export, contents)
-        sys.stderr.write(f"{arguments.export}: {count} transitions\n")
+        found["export"] = {"file": str(arguments.export), "transitions": count}
+    if arguments.json:
+        print(json.dumps(found))
+        return 0
+    show(found, Console(file=sys.stdout))
+    if arguments.export is not None:
+        print(f"\n{arguments.export}: {count} transitions")
     return 0
 
 

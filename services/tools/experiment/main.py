@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
     except OSError as error:
         raise RunDirectoryError(f"{out} cannot be written: {reason(error)}") from error
     sys.stdout.write(table(every))
-    _LOG.info("%d of %d results are in %s", len(results), len(every), out / _RESULTS)
+    print(f"{out / _RESULTS}: {len(results)} of {len(every)} results")
     return 0 if all(files.result() for files in asked) else 1
 
 
