@@ -9,6 +9,8 @@ from mrcdrl.common.runtime.process import run_main
 _COMMANDS = {
     "train": ("mrcdrl.services.train.main", "train on this machine: all processes, one command"),
     "experiment": ("mrcdrl.services.tools.experiment.main", "train a grid: settings and seeds"),
+    "runs": ("mrcdrl.services.tools.runs", "show the runs in a folder: state, success, disk"),
+    "runs rm": ("mrcdrl.services.tools.runs_rm", "remove runs, after asking"),
     "evaluate": (
         "mrcdrl.services.tools.evaluate",
         "run the paper's test on weights or a controller",

@@ -1,5 +1,6 @@
 """The configuration of a run: its schema, its sources, and its TOML form."""
 
+from mrcdrl.common.config.differences import differences, nearest_preset
 from mrcdrl.common.config.kept import refuse_changes
 from mrcdrl.common.config.load import (
     DEFAULT_PRESET,
@@ -36,10 +37,12 @@ __all__ = [
     "RunConfig",
     "TransportConfig",
     "apply_overrides",
+    "differences",
     "from_toml",
     "kept_settings",
     "load_config",
     "load_transport",
+    "nearest_preset",
     "preset_names",
     "refuse_changes",
     "resolved_environment",

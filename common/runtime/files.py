@@ -74,6 +74,18 @@ def lock_directory(path: Path) -> int:
     return descriptor
 
 
+def is_locked(path: Path) -> bool:
+    """Whether another process has locked a directory; raises OSError where it cannot be opened."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def prepare_output(path: Path) -> None:
     """Make the folder of a file that a command is to write, before its work begins.
 

@@ -118,6 +118,14 @@ class Recorder(Closing):
             content = summary_bytes(state, self._config, now, stop_reason)
             atomic_write(self.run_dir / SUMMARY, content)
 
+    def summarize(self, stop_reason: str) -> None:
+        """Write summary.json from what is recorded; for a run whose state is lost."""
+        self.flush()
+        with self._watching(f"writing {SUMMARY}"):
+            state = RunState(self._config)
+            now = self.restore(state, StoppingRule(self._config.run))
+            self.write_summary(state, now, stop_reason)
+
     def flush(self) -> None:
         """Hand buffered records to the operating system."""
         for file in (self._episodes, self._evaluations, self._metrics):

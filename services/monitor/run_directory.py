@@ -17,8 +17,19 @@ from typing import Self
 from mrcdrl.common.config import Config, load_config, refuse_changes, to_toml
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.runtime.closing import Closing
-from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, lock_directory, reason
+from mrcdrl.common.runtime.files import RUN_CONFIG, atomic_write, is_locked, lock_directory, reason
 from mrcdrl.common.sync.joining import ENDPOINT_FILE
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process holds the run: one that runs, records or removes it, or serves replay."""
+    return any(map(is_locked, lockable(path)))
+
+
+def lockable(path: Path) -> list[Path]:
+    """The directories that processes of a run lock."""
+    return [path, *sorted(path.glob("replay/[0-9]*"))]
+
 
 Check = Callable[[Config, Config], None]  # of what a run was made with, and is resumed with
 

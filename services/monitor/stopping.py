@@ -11,6 +11,14 @@ from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcom
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW
 
 _STOPPED = "stopped ("
+_FAILED = "failed ("
+_RULES = {  # by how the reason begins
+    "evaluation success": "target",
+    "learner step limit": "steps",
+    "the learner has finished": "steps",
+    "time limit": "time",
+    "no new maximum": "patience",
+}
 _EPOCHS = 16  # of evaluations that are kept; a run has one, and a peer may claim any
 
 
@@ -19,9 +27,24 @@ def stopped(cause: str) -> str:
     return f"{_STOPPED}{cause})"
 
 
+def failed(cause: str) -> str:
+    """Reason of a run that an error ended; it would have gone on."""
+    return f"{_FAILED}{cause})"
+
+
 def was_stopped(reason: str) -> bool:
-    """Whether a signal ended the run, and not its own rule."""
+    """Whether a signal ended the run."""
     return reason.startswith(_STOPPED)
+
+
+def has_failed(reason: str) -> bool:
+    """Whether an error ended the run."""
+    return reason.startswith(_FAILED)
+
+
+def rule_of(reason: str) -> str:
+    """The rule by which a run ended itself: target, steps, time or patience; "" without one."""
+    return next((rule for begin, rule in _RULES.items() if reason.startswith(begin)), "")
 
 
 class StoppingRule:

@@ -3,8 +3,10 @@
 import logging
 from collections.abc import Sequence
 
+from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.monitor.recorder import SUMMARY, Recorder
+from mrcdrl.services.monitor.stopping import failed
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.launcher import FILM, expectation, open_run, supervise, write_plots
 
@@ -21,7 +23,11 @@ def main(argv: Sequence[str]) -> int:
         fleet = Fleet(run.logs)
         try:
             with Recorder(run.path, run.config) as recorder:
-                reason = supervise(run, fleet, recorder, stop, hurry)
+                try:
+                    reason = supervise(run, fleet, recorder, stop, hurry)
+                except MrcdrlError as error:
+                    recorder.summarize(failed(str(error)))
+                    raise
         finally:
             fleet.stop()
         _LOG.info("%s; writing plots and video (Ctrl-C skips them) …", reason)

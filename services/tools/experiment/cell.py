@@ -28,7 +28,7 @@ from mrcdrl.services.monitor.records import (
     read_last_metrics,
     to_line,
 )
-from mrcdrl.services.monitor.stopping import was_stopped
+from mrcdrl.services.monitor.stopping import has_failed, was_stopped
 from mrcdrl.services.tools.experiment.grid import BEST, PROTOCOL, Cell
 
 RATES = (0.5, 0.8, 0.9, 0.93, 0.94)
@@ -109,8 +109,9 @@ class CellFiles:
 
     @property
     def trained(self) -> bool:
-        """Whether the training came to its own end, and was not stopped by a signal."""
-        return bool(self.summary) and not was_stopped(self.summary["stop_reason"])
+        """Whether the training came to its own end, and was not ended by a signal or an error."""
+        reason = self.summary.get("stop_reason")
+        return reason is not None and not (was_stopped(reason) or has_failed(reason))
 
     def train(self) -> list[str]:
         """Arguments of `mrcdrl train`, for a new run or to go on."""
