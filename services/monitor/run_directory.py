@@ -94,13 +94,22 @@ class RunDirectory(Closing):
 
         check: called before anything is written; what it raises leaves the run as it was.
         """
+        before, config = cls.resumed_config(path, overrides)
+        return cls._opened(path, config, resumed=True, check=lambda: check(before, config))
+
+    @staticmethod
+    def resumed_config(path: Path, overrides: dict[str, str]) -> tuple[Config, Config]:
+        """What a run was made with, and what it would be resumed with; nothing is written.
+
+        Raises RunDirectoryError if it is no run, or a setting changes that has to stay.
+        """
         file = path / RUN_CONFIG
         if not file.is_file():
             raise RunDirectoryError(f"{path} is not a run ({RUN_CONFIG} is missing)")
         before = load_config(str(file), environ={})
         config = load_config(str(file), overrides)
         refuse_changes(path, before, config)
-        return cls._opened(path, config, resumed=True, check=lambda: check(before, config))
+        return before, config
 
     @classmethod
     def join(cls, path: Path, config: Config) -> Self:

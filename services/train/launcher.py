@@ -10,7 +10,9 @@ import logging
 import os
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from mrcdrl.common.arena import test_starts
@@ -48,8 +50,25 @@ _SHORT = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The run that a command line asks for; nothing is written yet, and it is possible."""
+
+    path: Path
+    config: Config
+    base: str  # the preset, file or run that its settings come from
+    before: Config  # the settings of that
+    open: Callable[[], RunDirectory]  # creates or resumes the run
+    dry_run: bool
+
+
 def open_run(argv: Sequence[str]) -> RunDirectory:
     """Create or resume the run that the command line asks for."""
+    return plan_run(argv).open()
+
+
+def plan_run(argv: Sequence[str]) -> Plan:
+    """Read the command line, and refuse a run that is not possible; write nothing."""
     parser = Parser(prog="mrcdrl train", description="Train on this machine, with all processes.")
     parser.add_argument("--config", help=f"a preset or a TOML file; {DEFAULT_PRESET} by default")
     parser.add_argument(
@@ -57,6 +76,9 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     )
     parser.add_argument("--name", help="the same; made of preset, robots and time by default")
     parser.add_argument("--resume", metavar="RUN", help="go on with this run: name, path or latest")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="say what the run would be and take, and end"
+    )
     add_run_dir(parser)
     add_config_flags(parser, _SHORT)
     arguments = parser.parse_args(argv)
@@ -64,19 +86,29 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
     if arguments.resume:
         if arguments.name or arguments.config:
             parser.error("--resume keeps the run's name and configuration: no --name or --config")
-        path = find_run(arguments.resume, arguments.run_dir)
-
-        def check(before: Config, now: Config) -> None:
-            check_possible(now, resumed=True)
-            check_unfinished(path, before, now, given)
-
-        return RunDirectory.resume(path, given, check)
+        return _resumption(
+            find_run(arguments.resume, arguments.run_dir), given, dry_run=arguments.dry_run
+        )
     preset = arguments.config or DEFAULT_PRESET
     config = load_config(preset, given)
     check_possible(config)
     name = arguments.name or default_name(preset, config.arena.num_robots)
     path = new_run_path(name, arguments.run_dir)
-    return (RunDirectory.create if arguments.name else RunDirectory.create_free)(path, config)
+    create = RunDirectory.create if arguments.name else RunDirectory.create_free
+    before = load_config(preset, environ={})
+    return Plan(path, config, preset, before, partial(create, path, config), arguments.dry_run)
+
+
+def _resumption(path: Path, given: dict[str, str], *, dry_run: bool) -> Plan:
+    def check(before: Config, now: Config) -> None:
+        check_possible(now, resumed=True)
+        check_unfinished(path, before, now, given)
+
+    before, config = RunDirectory.resumed_config(path, given)
+    resume = partial(RunDirectory.resume, path, given, check)
+    if dry_run:
+        check(before, config)
+    return Plan(path, config, path.name, before, resume, dry_run)
 
 
 def check_possible(config: Config, *, resumed: bool = False) -> None:

@@ -1,6 +1,7 @@
 """`mrcdrl train`: one command from the first frame to an evaluated policy, on this machine."""
 
 import logging
+import sys
 from collections.abc import Sequence
 
 from mrcdrl.common.errors import MrcdrlError
@@ -8,14 +9,19 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.monitor.recorder import SUMMARY, Recorder
 from mrcdrl.services.monitor.stopping import failed
 from mrcdrl.services.train.fleet import Fleet
-from mrcdrl.services.train.launcher import FILM, expectation, open_run, supervise, write_plots
+from mrcdrl.services.train.forecast import forecast
+from mrcdrl.services.train.launcher import FILM, expectation, plan_run, supervise, write_plots
 
 _LOG = logging.getLogger("train")
 
 
 def main(argv: Sequence[str]) -> int:
     """Train; the exit code."""
-    with open_run(argv) as run:
+    plan = plan_run(argv)
+    if plan.dry_run:
+        sys.stdout.write(forecast(plan))
+        return 0
+    with plan.open() as run:
         hurry = StopSignal()
         stop = StopSignal().listen(then=hurry)
         prefix = "resuming " if run.resumed else ""
