@@ -10,7 +10,7 @@ import logging
 import os
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -234,33 +234,43 @@ def num_actors(config: Config) -> int:
 def write_plots(run_dir: Path, hurry: StopSignal) -> None:
     """Write the plots and the video of a run, in a separate process, unless a signal skips them.
 
-    Log why they are missing.
+    Log its progress, or why they are missing.
     """
     film = run_dir / FILM
     before = film.stat().st_mtime_ns if film.exists() else None
-    command = [*COMMAND, "report", str(run_dir)]
-    environment = {**os.environ, DIE_WITH_PARENT: str(os.getpid())}
     report = subprocess.Popen(
-        command,
+        [*COMMAND, "report", str(run_dir)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
+        env={**os.environ, DIE_WITH_PARENT: str(os.getpid())},
         start_new_session=True,
     )
-    deadline = time.monotonic() + _PLOTS_S
-    while not hurry.is_set() and time.monotonic() < deadline:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            _, said = report.communicate(timeout=_TICK_S)
-            break
-    else:
+    last_line, deadline = "no reason given", time.monotonic() + _PLOTS_S
+    for line in _lines_until(report, lambda: hurry.is_set() or time.monotonic() > deadline):
+        last_line = line
+        if not line.startswith("mrcdrl: "):
+            _LOG.info("%s", line)
+    if report.poll() is None:
         report.kill()
-        report.communicate()
+        report.wait()
         if film.exists() and film.stat().st_mtime_ns != before:
             film.unlink()  # it is written last, and was cut off
         why = f"skipped ({hurry.cause})" if hurry.is_set() else f"given up after {_PLOTS_S:g} s"
         _LOG.warning("plots and video %s; `mrcdrl report %s` writes them", why, run_dir)
-        return
-    if report.returncode:
-        last_line = (said.splitlines() or ["no reason given"])[-1]
+    elif report.returncode:
         _LOG.warning("plots or video are missing: %s", last_line)
+
+
+def _lines_until(process: "subprocess.Popen[bytes]", enough: Callable[[], bool]) -> Iterator[str]:
+    """Yield the lines that a process writes to its stderr, until it ends or `enough` says so."""
+    if process.stderr is None:
+        raise ValueError("the process writes elsewhere")
+    with process.stderr as pipe:
+        os.set_blocking(pipe.fileno(), False)
+        waiting, ended = b"", False
+        while not (ended or enough()):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_TICK_S)
+                ended = True
+            *whole, waiting = (waiting + (pipe.read() or b"")).split(b"\n")
+            yield from (line.decode("utf-8", "replace") for line in whole)

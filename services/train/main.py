@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.services.monitor.recorder import SUMMARY, Recorder
+from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.stopping import failed
+from mrcdrl.services.train.ending import ending
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.forecast import forecast
-from mrcdrl.services.train.launcher import FILM, expectation, plan_run, supervise, write_plots
+from mrcdrl.services.train.launcher import expectation, plan_run, supervise, write_plots
 
 _LOG = logging.getLogger("train")
 
@@ -38,6 +39,5 @@ def main(argv: Sequence[str]) -> int:
             fleet.stop()
         _LOG.info("%s; writing plots and video (Ctrl-C skips them) …", reason)
         write_plots(run.path, hurry)
-    left = [name for name in (SUMMARY, "training.png", FILM) if (run.path / name).is_file()]
-    _LOG.info("the run is in %s%s", run.path, ": " * bool(left) + ", ".join(left))
+    sys.stdout.write(ending(run.path, reason))
     return 0

@@ -60,14 +60,19 @@ def metric(run: Path, name: str) -> float:
 
 def test_a_run_ends_by_itself_and_prints_plain_lines(finished: Finished) -> None:
     assert finished.code == 0, finished.err
-    lines = finished.out.splitlines()
+    lines, _, end = finished.out.partition("ended     learner step limit reached (60)\n")
     assert lines
-    for line in lines:
+    for line in lines.splitlines():
         assert re.match(r"\d+:\d\d:\d\d  .*robot steps \d+ .*replay \d+/20000  learner steps", line)
     assert "  starting, waiting for " in lines[0]
     assert "\x1b" not in finished.out
     assert "Traceback" not in finished.err
     assert "learner step limit reached (60)" in finished.err
+    named = [line.split()[0] for line in end.splitlines() if not line.startswith(" ")]
+    assert named == ["success", "took", "next", "files"]
+    assert re.match(r"success   \d+\.\d % of \d+ episodes", end)
+    assert re.search(rf"^ +mrcdrl train --resume {finished.path} --minutes 30", end, re.M)
+    assert re.search(r"^files .*summary\.json.*training\.png.*evaluation\.mp4$", end, re.M)
 
 
 def test_nothing_of_a_finished_run_is_left_behind(finished: Finished) -> None:
@@ -214,7 +219,7 @@ def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: P
             terminal.type(b"\x03")
             terminal.read(lambda: train.process.poll() is not None, "the end")
             assert train.wait() == 0, terminal.text[-3000:]
-            terminal.read(lambda: "the run is in" in terminal.text, "the last line")
+            terminal.read(lambda: "evaluation.mp4" in terminal.text, "the last line")
         assert terminal.raw.rstrip().endswith(b"evaluation.mp4")
         assert b"\x1b[?1049l" in terminal.raw  # the screen as it was before
         assert b"\x1b[?25h" in terminal.raw  # the cursor shown again

@@ -118,7 +118,8 @@ def test_status_tells_the_runs_time_and_a_closed_terminal_and_a_second_signal_en
             assert train.wait() == 0, train.err
         assert "stopping learner-0 …" in train.err
         assert f"plots and video skipped (Ctrl-C); `mrcdrl report {run}` writes them" in train.err
-        assert train.err.endswith(f"the run is in {run}: summary.json\n")
+        assert f"\nfiles     {run}: summary.json" in train.out
+        assert "training.png" not in train.out
         assert "ended with code" not in train.err
         with Command(asked, tmp_path) as status:
             assert status.wait() == 1

@@ -127,6 +127,16 @@ def test_a_signal_skips_the_plots_and_leaves_whole_files_only(
     assert (tmp_path / FILM).exists() == (not films)
 
 
+def test_the_progress_of_plots_is_logged_as_it_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    reports = "import sys; print('training.png …', 'episodes: 0 of 12', sep='\\n', file=sys.stderr)"
+    monkeypatch.setattr(launcher, "COMMAND", (sys.executable, "-c", reports))
+    write_plots(tmp_path, StopSignal())
+    assert caplog.messages == ["training.png …", "episodes: 0 of 12"]
+
+
 def test_the_reason_why_plots_are_missing_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
