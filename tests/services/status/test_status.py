@@ -166,9 +166,10 @@ def test_who_does_not_wait_for_a_run_is_told_why_it_is_not_up(
     how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked, stop = ["--run", "gone", "--run-dir", str(tmp_path)], StopSignal()
+    asked += ["--connect", free_endpoint()]
     if how != "looks once":
         asked.append("--watch")
         stop.set()
-    with ExitStack() as owned, pytest.raises(UnreachableError, match="run gone is not up: no run"):
+    with ExitStack() as owned, pytest.raises(UnreachableError, match="run gone is not up: nobody"):
         join(parser().parse_args(asked), stop, owned)
     assert capsys.readouterr().err == ""
