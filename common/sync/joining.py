@@ -102,7 +102,7 @@ def fetch_config(
     """Ask replay for the run's configuration, and put this process's own settings over it.
 
     Raises, once the time is over, DeadlineError if nobody serves that run, WireError or
-    RefusedError if the answer is no configuration: another process may answer in replay's place.
+    RefusedError if the answer is not a configuration: another process may have answered.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)
