@@ -3,7 +3,6 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CONFIG ?= quick
-ROBOTS ?= 2
 ARGS ?=
 # Where PyTorch comes from: its own index of builds for CPUs or, where there is a GPU, pip's index. If it
 # cannot be reached, that is known soon, and pip's index serves.
@@ -26,7 +25,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 train: install
-	$(BIN)/mrcdrl train --config $(CONFIG) --robots $(ROBOTS) $(ARGS)
+	$(BIN)/mrcdrl train --config $(CONFIG) $(if $(ROBOTS),--robots $(ROBOTS)) $(ARGS)
 
 # By several processes, each with a file of tests at a time; ARGS="-n 0" runs all in one.
 test: install

@@ -3,6 +3,11 @@
 Invariants: each arena is reset, stepped until its LAST time step, and reset again. An arena draws
 every random number from its own generator, so a seed gives the same episodes in every process,
 whatever the other arenas do. Actions are LEFT, STRAIGHT and RIGHT of the scene module.
+
+Where the number of robots differs between episodes, arrays are as long as for the most robots, and
+an episode's robots are the first ones. The others are absent: their poses are NaN, and so are the
+targets that an episode does not have. They have failed from the start, meet nothing, are not
+rendered, and get no reward; their actions are ignored.
 """
 
 from collections.abc import Sequence
@@ -52,6 +57,7 @@ class ArenaBatch:
         self._max_collisions = config.max_collisions if max_collisions is None else max_collisions
         self._sensors = Sensors(config, rngs)
         self._physics = _make_physics(config, len(rngs))
+        self._by_number = {number: config.with_robots(number) for number in config.numbers}
         self._targets = np.zeros((len(rngs), config.target_count, 2))
         self._obstacles = np.zeros((len(rngs), config.obstacle_count, 3))
         self._running = np.zeros(len(rngs), np.bool_)
@@ -62,7 +68,11 @@ class ArenaBatch:
         """Robot collisions in each arena's episode [A]; two robots that run into each other
         count as two."""
         self.failed: BoolArray = np.zeros((len(rngs), config.num_robots), np.bool_)
-        """Robots that stand still until the end of their episode [A, K]."""
+        """Robots that stand still until the end of their episode [A, K]; absent ones among them."""
+        self.present: Int64Array = np.full(len(rngs), config.num_robots, np.int64)
+        """Robots of each arena's episode [A]; any others are absent."""
+        self.chances: Float64Array = np.full(len(config.numbers), 1 / len(config.numbers))
+        """Probability with which an episode draws each of config.numbers."""
         for arena in range(len(rngs)):
             self._place(arena, self._random_start(arena))
 
@@ -70,23 +80,26 @@ class ArenaBatch:
         return len(self._rngs)
 
     def scene(self, arena: int) -> Scene:
-        """A copy of the true state of an arena."""
-        return self._scenes(np.array(arena))
+        """A copy of the true state of an arena, without what is absent."""
+        scene, number = self._scenes(np.array(arena)), int(self.present[arena])
+        num_targets = self._by_number[number].target_count
+        return Scene(scene.robots[:number], scene.targets[:num_targets], scene.obstacles)
 
     def reset(self, arena: int, start: Start | None = None) -> TimeStep:
         """Begins an episode of an arena at the given start, or at a random one.
 
-        Raises ValueError if the start has wrong shapes or overlapping robots.
+        A start has as many robots as its episode. Raises ValueError if it has wrong shapes or
+        overlapping robots.
         """
         self._running[arena] = False
         self._place(arena, self._random_start(arena) if start is None else start)
         self._running[arena] = True
         self.frames[arena] = self.collisions[arena] = 0
-        self.failed[arena] = False
+        self.failed[arena] = np.arange(self._config.num_robots) >= self.present[arena]
         num_robots = self._config.num_robots
         return TimeStep(
             step_type=StepType.FIRST,
-            records=self._sensors.first(arena, self.scene(arena)),
+            records=self._sensors.first(arena, self._scenes(np.array(arena))),
             rewards=np.zeros(num_robots, np.float32),
             discount=1.0,
             collided=np.zeros(num_robots, np.bool_),
@@ -157,11 +170,14 @@ class ArenaBatch:
         return tuple(outcomes)
 
     def _random_start(self, arena: int) -> Start:
-        rng = self._rngs[arena]
-        return training_start(self._config, layout_for(self._config, rng), rng)
+        rng, config = self._rngs[arena], self._config
+        if config.mixes_numbers:
+            config = self._by_number[int(rng.choice(config.numbers, p=self.chances))]
+        return training_start(config, layout_for(config, rng), rng)
 
     def _place(self, arena: int, start: Start) -> None:
-        config = self._config
+        number = len(start.robots)
+        config = self._by_number.get(number, self._config)
         shapes = (start.robots.shape, start.targets.shape, start.obstacles.shape)
         expected = (config.num_robots, 3), (config.target_count, 2), (config.obstacle_count, 3)
         if shapes != expected:
@@ -171,8 +187,10 @@ class ArenaBatch:
         if not np.isfinite(start.targets).all():
             raise ValueError(f"start has targets that are not finite: {start.targets.tolist()}")
         self._physics.place(arena, start.robots, start.obstacles)
-        self._targets[arena] = start.targets
+        self._targets[arena] = np.nan
+        self._targets[arena, : config.target_count] = start.targets
         self._obstacles[arena] = start.obstacles
+        self.present[arena] = number
 
 
 def make_arenas(

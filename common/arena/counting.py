@@ -129,6 +129,10 @@ class CountingBatch:
         """identities: one per arena."""
         self._num_robots = config.num_robots
         self._arenas = [CountingArena(config, identity=identity) for identity in identities]
+        self.present: Int64Array = np.full(len(identities), config.num_robots, np.int64)
+        """Robots of each arena's episode [A]: all of them."""
+        self.chances: Float64Array = np.ones(1)
+        """Probability of each number of robots: there is one."""
 
     def __len__(self) -> int:
         return len(self._arenas)

@@ -24,6 +24,7 @@ DEFAULT_PRESET = "quick"  # of commands that get no --config
 ENV_PREFIX = "MRCDRL_"
 EXTENDS = "extends"
 _SHOWN = 200  # characters of a wrong value
+_SPELLINGS = {"num_robots", "robots"}  # of how many robots there are
 _TYPES = {
     "int": "must be a whole number",
     "float": "must be a number",
@@ -76,7 +77,16 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
     if base in (*above, source):
         raise ConfigError(f"config {source!r} extends itself via {', '.join((*above, source))}")
     below = _read_toml(base, (*above, source))
-    return below | {name: {**below.get(name, {}), **values} for name, values in table.items()}
+    return below | {name: _merged(below.get(name, {}), values) for name, values in table.items()}
+
+
+def _merged(below: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """A section's values over those below; of two spellings of one setting the last counts."""
+    kept = dict(below)
+    if len(_SPELLINGS & values.keys()) == 1:
+        for spelling in _SPELLINGS:
+            kept.pop(spelling, None)
+    return {**kept, **values}
 
 
 def _check_names(table: Mapping[str, Any], where: str) -> None:
@@ -109,7 +119,7 @@ def _merge_text(table: dict[str, Any], dotted: str, text: str, where: str) -> No
         raise ConfigError(f"{where}: {dotted!r} is not a setting; write SECTION.FIELD")
     value = {name: _parse_value(text)}
     _check_names({section: value}, where)
-    table[section] = {**table.get(section, {}), **value}
+    table[section] = _merged(table.get(section, {}), value)
 
 
 def environment_overrides(environ: Mapping[str, str]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 
-def value_at(points: Sequence[tuple[int, float]], learner_step: int) -> float:
+def value_at(points: Sequence[tuple[float, float]], learner_step: int) -> float:
     """The value at a learner step: linear between the points, constant before and after them."""
     steps = [step for step, _ in points]
     values = [value for _, value in points]

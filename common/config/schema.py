@@ -5,7 +5,7 @@ where that settles it ("ancestor"), and ours otherwise ("ours").
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self, cast
 
@@ -23,6 +23,7 @@ _FINEST_PX = 2.5  # arena px per image px; below, the literal renderer draws
 
 _LONGEST_S = 1e9  # thirty years; the system's waits overflow beyond nine times that
 LARGEST = 2**63 - 1  # whole number that TOML, torch and the wire all take
+MOST_ROBOTS = 10
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -71,10 +72,15 @@ class ArenaConfig(Section):
     physics: Literal["array", "pymunk"] = "array"
     """Physics engine: compiled arrays, or pymunk, the reference; both give the same poses.
     (ours; ancestor: pymunk)"""
-    num_robots: Annotated[int, Field(ge=1, le=10)] = 2
-    """(paper: 2, 3, 4)"""
+    num_robots: Annotated[int, Field(ge=1, le=MOST_ROBOTS)] = 2
+    """Robots in every episode; with robots, the greatest of its numbers. (paper: 2, 3, 4)"""
+    robots: tuple[int, ...] = ()
+    """Numbers of robots, such as [1, 2, 4], in rising order: each episode of training draws one, by
+    the weights of [curriculum], and evaluations test each apart; empty: always num_robots. Of
+    num_robots and robots, give one. (ours)"""
     num_targets: Annotated[int, Field(ge=0, le=20)] = 0
-    """Targets; every robot needs one; 0: as many as robots. (paper: as many as robots)"""
+    """Targets; every robot needs one; 0: as many as the episode has robots. (paper: as many as
+    robots)"""
     size_px: Annotated[int, Field(ge=120)] = 600
     """Width and height of the square arena. (paper)"""
     wall_offset_px: Annotated[float, Field(ge=0)] = 10
@@ -147,8 +153,24 @@ class ArenaConfig(Section):
     """Content of a record: poses from which the image is rendered, or its pixels. (ours)"""
 
     @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of robots that an episode may have, rising; the last one is num_robots."""
+        return self.robots or (self.num_robots,)
+
+    @property
+    def mixes_numbers(self) -> bool:
+        """Whether the number of robots differs between episodes."""
+        return len(self.numbers) > 1
+
+    def with_robots(self, number: int) -> Self:
+        """The same arena with this number of robots in every episode."""
+        if self.numbers == (number,):
+            return self
+        return self.model_copy(update={"num_robots": number, "robots": ()})
+
+    @property
     def target_count(self) -> int:
-        """Number of targets in an episode."""
+        """Greatest number of targets in an episode."""
         return self.num_targets or self.num_robots
 
     @property
@@ -169,8 +191,18 @@ class ArenaConfig(Section):
         layout = 2 * self.target_count + 3 * self.obstacle_count
         return 4 * (3 * self.num_robots + layout + bool(self.pixel_noise))
 
+    @model_validator(mode="before")
+    @classmethod
+    def _derive_num_robots(cls, given: Any) -> Any:
+        """Let robots alone decide, where num_robots is not given."""
+        robots = given.get("robots") if isinstance(given, dict) else None
+        if isinstance(robots, (list, tuple)) and robots and "num_robots" not in given:
+            return {**given, "num_robots": robots[-1]}
+        return given
+
     @model_validator(mode="after")
     def _check(self) -> Self:
+        self._check_robots()
         inner = self.size_px - 2 * (self.wall_offset_px + self.wall_thickness_px)
         if inner < 2 * self.robot_radius_px:
             raise ValueError(
@@ -208,6 +240,24 @@ class ArenaConfig(Section):
                 'kind = "counting" encodes its counters in pixels: set codec = "frames"'
             )
         return self
+
+    def _check_robots(self) -> None:
+        """Raise ValueError if robots and the settings that depend on it do not fit."""
+        numbers = self.numbers
+        if list(numbers) != sorted(set(numbers)) or numbers[0] < 1:
+            raise ValueError(f"robots {list(numbers)} do not rise from 1 or more")
+        if numbers[-1] != self.num_robots:
+            raise ValueError(
+                f"num_robots {self.num_robots} is not the last of robots {list(numbers)}; give one "
+                "of the two"
+            )
+        if self.mixes_numbers and self.kind == "counting":
+            raise ValueError('kind = "counting" needs a fixed number of robots, num_robots')
+        if self.mixes_numbers and self.targets_px and not self.num_targets:
+            raise ValueError(
+                f"targets_px has the same {len(self.targets_px)} targets for each of robots "
+                f"{list(numbers)}: set num_targets too"
+            )
 
 
 class AgentConfig(Section):
@@ -269,7 +319,7 @@ class AgentConfig(Section):
         return self
 
 
-def _check_schedule(name: str, points: Schedule) -> None:
+def _check_schedule(name: str, points: Sequence[tuple[float, float]]) -> None:
     steps = [step for step, _ in points]
     if not steps or steps[0] != 0 or steps != sorted(set(steps)):
         raise ValueError(f"{name} needs points whose steps rise from 0")
@@ -297,6 +347,30 @@ class ExplorationConfig(Section):
         _check_schedule("schedule", self.schedule)
         if any(not 0 <= epsilon <= 1 for _, epsilon in self.schedule):
             raise ValueError("schedule has an epsilon outside 0 ... 1")
+        return self
+
+
+class CurriculumConfig(Section):
+    """How often each number of arena.robots is played, as a share of the transitions."""
+
+    kind: Literal["schedule", "automatic"] = "schedule"
+    """`schedule`: weights over learner steps. `automatic`: by the success p so far of each number,
+    in each actor, in proportion to p (1 - p): what is neither solved nor hopeless is played most.
+    (ours; rule: Tzannetos et al. 2023, as Florensa et al. 2018 choose goals)"""
+    schedule: tuple[tuple[float, ...], ...] = ()
+    """Points [learner step, a weight for each of arena.robots], linear between, constant after the
+    last, such as [[0, 1, 0], [5000, 1, 3]]; empty: equal weights. (ours)"""
+    floor: Fraction = 0.2
+    """Part of the transitions that `automatic` spreads evenly over all numbers. (ours)"""
+    memory_episodes: Count = 50
+    """Episodes of a number, over which its success is averaged exponentially. (ours)"""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.schedule:
+            if any(not point or min(point) < 0 or sum(point[1:]) <= 0 for point in self.schedule):
+                raise ValueError("schedule has a weight below 0, or a point without one above 0")
+            _check_schedule("schedule", [(point[0], 0) for point in self.schedule])
         return self
 
 
@@ -523,6 +597,7 @@ class Config(Section):
     arena: ArenaConfig = ArenaConfig()
     agent: AgentConfig = AgentConfig()
     exploration: ExplorationConfig = ExplorationConfig()
+    curriculum: CurriculumConfig = CurriculumConfig()
     replay: ReplayConfig = ReplayConfig()
     actor: ActorConfig = ActorConfig()
     learner: LearnerConfig = LearnerConfig()
@@ -544,6 +619,12 @@ class Config(Section):
                 f"replay.min_size {self.replay.min_size}{shares} is below learner.batch_size "
                 f"{smallest}: the first batch would repeat transitions"
             )
+        numbers = self.arena.numbers
+        if any(len(point) != 1 + len(numbers) for point in self.curriculum.schedule):
+            raise ValueError(
+                "curriculum.schedule needs points of a learner step and a weight for each of "
+                f"arena.robots {list(numbers)}"
+            )
         if self.run.turn_size:
             self._check_lockstep()
         return self
@@ -557,6 +638,7 @@ class Config(Section):
         reasons = {
             "needs a single actor (run.actors)": self.run.actors > 1,
             "needs a single shard (replay.shards)": replay.shards > 1,
+            "needs one number of robots (arena.robots)": self.arena.mixes_numbers,
             'needs a log, and replay.fsync "off" keeps none': replay.fsync == "off",
             'needs replay.sampler "uniform": priorities arrive at any time': replay.prioritized,
             f"is not a multiple of {robots}, the robots of one actor": turn_size % robots,

@@ -1,7 +1,8 @@
 """Steps many arenas together, with one batched inference for all of their robots.
 
 Invariants: the policy sees images rendered from the very records that go to replay; no threads, no
-transport, no decisions by the clock; each arena explores independently.
+transport, no decisions by the clock; each arena explores independently. Robots that are absent from
+an episode are not acted for and bear no transitions.
 """
 
 import time
@@ -17,11 +18,13 @@ from mrcdrl.common.messages.trajectory import (
     EpisodeSummary,
     Float32Array,
     Float64Array,
+    Int64Array,
     TimeStep,
     UInt8Array,
 )
 from mrcdrl.common.model.policy import FrameStack, Policy
 from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
+from mrcdrl.services.actor.curriculum import Curriculum
 from mrcdrl.services.actor.training_rewards import TrainingRewards
 
 
@@ -64,6 +67,8 @@ class Collector:
         self._policy = policy
         self._rng = rng
         self._num_robots = config.arena.num_robots
+        self._mixes_numbers = config.arena.mixes_numbers
+        self.curriculum = Curriculum(config.curriculum, config.arena)
         self._chunkers = [
             [Chunker(chunking) for _ in range(self._num_robots)] for _ in range(len(arenas))
         ]
@@ -73,18 +78,14 @@ class Collector:
         self._rewards = TrainingRewards(config, arenas)
         self.seconds = Seconds()
         self.env_steps = 0
+        self.robot_steps = 0  # transitions collected so far
         self.num_episodes = 0
         self._reset(range(len(arenas)))
 
     @property
     def num_robots(self) -> int:
-        """Robots in all arenas, and so transitions per step."""
+        """Robots in all arenas, and so the most transitions of a step."""
         return len(self._arenas) * self._num_robots
-
-    @property
-    def robot_steps(self) -> int:
-        """Transitions collected so far."""
-        return self.env_steps * self._num_robots
 
     def step(
         self, epsilons: Float32Array, *, truncate: bool = False
@@ -94,15 +95,11 @@ class Collector:
         truncate: this is the last step; the episodes are chunked to here, as if truncated.
         """
         started = time.perf_counter()
-        per_robot = np.repeat(epsilons, self._num_robots)
-        selection = self._policy.select_actions(self._frames.stacks, per_robot, self._rng)
+        present = self._arenas.present.copy()
+        actions, taken_q, greedy_q = self._select_actions(epsilons, present)
         inferred = time.perf_counter()
-        shape = (len(self._arenas), self._num_robots)
-        actions = selection.actions.reshape(shape)
         time_steps = self._arenas.step(actions)
         stepped = time.perf_counter()
-        taken_q = selection.taken_q.reshape(shape)
-        greedy_q = selection.greedy_q.reshape(shape)
         rewards = self._rewards.after(time_steps, self._policy.learner_step)
         chunks = [
             chunk
@@ -117,20 +114,23 @@ class Collector:
                 truncate,
             )
         ]
-        mean_q = greedy_q.mean(axis=1)
-        for episode, time_step, q in zip(self._episodes, time_steps, mean_q, strict=True):
+        mean_q = greedy_q.sum(axis=1) / present.astype(np.float32)
+        for episode, time_step, q, number in zip(
+            self._episodes, time_steps, mean_q, present.tolist(), strict=True
+        ):
             episode.frames += 1
-            episode.rewards += float(time_step.rewards.mean())
+            episode.rewards += float(time_step.rewards[:number].mean())
             episode.collisions += int(time_step.collided.sum())
             episode.greedy_q += float(q)
             episode.versions.append(self._policy.weights_version)
         ended = [index for index, time_step in enumerate(time_steps) if time_step.last]
         summaries = [self._summary(i, time_steps[i], float(epsilons[i])) for i in ended]
         chunked = time.perf_counter()
-        records = time_steps.records.reshape(len(per_robot), -1)
+        records = time_steps.records.reshape(self.num_robots, -1)
         self._frames.push(self._codec.decode(records))
         self._reset(ended)
         self.env_steps += len(self._arenas)
+        self.robot_steps += int(present.sum())
         self.seconds.inference += inferred - started
         self.seconds.arena += stepped - inferred
         self.seconds.chunk += chunked - stepped
@@ -141,6 +141,26 @@ class Collector:
         """Continue the counters of a previous collector."""
         self.seconds = before.seconds
         self.env_steps, self.num_episodes = before.env_steps, before.num_episodes
+        self.robot_steps = before.robot_steps
+
+    def _select_actions(
+        self, epsilons: Float32Array, present: Int64Array
+    ) -> tuple[UInt8Array, Float32Array, Float32Array]:
+        """Actions, their values and those of the best ones, each [A, K]; 0 for absent robots."""
+        shape = (len(self._arenas), self._num_robots)
+        per_robot, stacks = np.repeat(epsilons, self._num_robots), self._frames.stacks
+        if not self._mixes_numbers:
+            chosen = self._policy.select_actions(stacks, per_robot, self._rng)
+            columns = (chosen.actions, chosen.taken_q, chosen.greedy_q)
+            return columns[0].reshape(shape), columns[1].reshape(shape), columns[2].reshape(shape)
+        there = (np.arange(self._num_robots) < present[:, None]).reshape(-1)
+        chosen = self._policy.select_actions(stacks[there], per_robot[there], self._rng)
+        actions, taken_q = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
+        greedy_q = np.zeros(shape, np.float32)
+        actions.reshape(-1)[there] = chosen.actions
+        taken_q.reshape(-1)[there] = chosen.taken_q
+        greedy_q.reshape(-1)[there] = chosen.greedy_q
+        return actions, taken_q, greedy_q
 
     def _add(
         self,
@@ -152,7 +172,7 @@ class Collector:
         time_step: TimeStep,
         truncate: bool,
     ) -> Iterator[Chunk]:
-        for robot, chunker in enumerate(self._chunkers[index]):
+        for robot, chunker in enumerate(self._chunkers[index][: self._arenas.present[index]]):
             yield from chunker.add(
                 int(actions[robot]),
                 float(rewards[robot]),
@@ -167,10 +187,12 @@ class Collector:
 
     def _reset(self, indices: Sequence[int]) -> None:
         """Start new episodes in these arenas."""
+        if indices and self._mixes_numbers:
+            self._arenas.chances = self.curriculum.chances(self._policy.learner_step)
         for index in indices:
             time_step = self._arenas.reset(index)
-            for chunker, record in zip(self._chunkers[index], time_step.records, strict=True):
-                chunker.start(record)
+            for robot in range(self._arenas.present[index]):
+                self._chunkers[index][robot].start(time_step.records[robot])
             first = index * self._num_robots
             states = slice(first, first + self._num_robots)
             self._frames.reset(states, self._codec.decode(time_step.records))
@@ -182,6 +204,8 @@ class Collector:
             raise ValueError("an arena ended an episode without an outcome")
         self._episodes[index] = _Episode()
         self.num_episodes += 1
+        number = int(self._arenas.present[index])
+        self.curriculum.add(number, time_step.outcome, episode.frames)
         return EpisodeSummary(
             actor=self._actor,
             arena=index,

@@ -43,8 +43,8 @@ class SceneCodec:
     """Stores the scene, its own robot first; the image is rendered when it is decoded.
 
     A record holds little-endian float32: own x, y, heading; x, y, heading of the other robots in
-    order; x, y of the targets; x, y, radius of the obstacles. With pixel_noise, the seed of the
-    noise follows as uint32.
+    order; x, y of the targets; x, y, radius of the obstacles. What is absent is NaN, and not
+    rendered. With pixel_noise, the seed of the noise follows as uint32.
     """
 
     def __init__(self, config: ArenaConfig) -> None:

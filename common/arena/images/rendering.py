@@ -2,7 +2,8 @@
 
 Invariants: position x of the arena is rendered at OpenCV's coordinate x - 1/2, because OpenCV
 counts from pixel centres and the arena from pixel edges. Filled shapes cover the area they have in
-the world (OpenCV fills a disc's rim too, so discs are rendered half a pixel smaller).
+the world (OpenCV fills a disc's rim too, so discs are rendered half a pixel smaller). What is
+absent, NaN, is not rendered.
 """
 
 import math
@@ -38,18 +39,18 @@ def render_arena(
     _fill(image, inner * scale, size - inner * scale, BLACK)
     for wall in inner_walls(config):
         _render_wall(image, wall * scale, line_type)
-    for x, y, radius in (scene.obstacles * scale).tolist():
+    for x, y, radius in _there(scene.obstacles * scale):
         _render_disc(image, x, y, radius, GREEN, line_type)
     half = config.target_size_px / 2
-    for x, y in scene.targets.tolist():
+    for x, y in _there(scene.targets):
         corners = np.array([[x - half, y - half], [x + half, y + half]]) * scale
         (left, top), (right, bottom) = np.rint(corners).astype(int).tolist()
         image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = BLUE
     radius = config.robot_radius_px * scale
-    for x, y, _ in scene.robots.tolist():
+    for x, y, _ in _there(scene.robots):
         _render_disc(image, x * scale, y * scale, radius, WHITE, line_type)
     width = max(1, round(HEADING_WIDTH_PX * scale))
-    for x, y, heading in scene.robots.tolist():
+    for x, y, heading in _there(scene.robots):
         rim = (x * scale + radius * math.cos(heading), y * scale + radius * math.sin(heading))
         start = _fixed(x * scale, y * scale)
         cv2.line(image, start, _fixed(*rim), BLACK, width, line_type, _SHIFT)
@@ -64,8 +65,10 @@ def literal_views(scene: Scene, config: ArenaConfig) -> UInt8Array:
     """
     image = render_arena(scene, config, config.size_px)
     grayscale = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-    views = np.empty((len(scene.robots), config.view_px, config.view_px), np.uint8)
+    views = np.zeros((len(scene.robots), config.view_px, config.view_px), np.uint8)
     for i, (x, y, heading) in enumerate(scene.robots.tolist()):
+        if not math.isfinite(x + y + heading):
+            continue  # an absent robot sees nothing
         window = (
             _turned_window(grayscale, x, y, heading, config)
             if config.orientation == "heading_up"
@@ -74,6 +77,12 @@ def literal_views(scene: Scene, config: ArenaConfig) -> UInt8Array:
         size = (config.view_px, config.view_px)
         views[i] = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
     return views
+
+
+def _there(rows: Float64Array) -> list[list[float]]:
+    """The rows [..., 2 or 3] of what is not absent."""
+    kept: list[list[float]] = rows[np.isfinite(rows).all(axis=1)].tolist()
+    return kept
 
 
 def _window(grayscale: UInt8Array, x: float, y: float, config: ArenaConfig) -> UInt8Array:

@@ -83,12 +83,13 @@ def _given_targets(config: ArenaConfig) -> Float64Array:
 def layout_symmetries(config: ArenaConfig) -> tuple[Symmetry, ...]:
     """Symmetries of the square under which an agent's experience stays valid.
 
-    Unrotated images: those that map all fixed targets, obstacles and inner walls onto themselves;
-    all 8 if nothing is fixed. Heading-up images do not change when the arena is rotated, and a
-    reflection mirrors them left to right: so the identity, and the mirror if a reflection maps the
-    layout onto itself.
+    Unrotated images: those that map all fixed targets, obstacles and inner walls onto themselves,
+    for each number of robots; all 8 if nothing is fixed. Heading-up images do not change when the
+    arena is rotated, and a reflection mirrors them left to right: so the identity, and the mirror
+    if a reflection maps the layout onto itself.
     """
-    kept = tuple(symmetry for symmetry in SYMMETRIES if _maps_onto_itself(symmetry, config))
+    each = [config.with_robots(number) for number in config.numbers]
+    kept = tuple(s for s in SYMMETRIES if all(_maps_onto_itself(s, one) for one in each))
     if config.orientation == "unrotated":
         return kept
     mirror = Symmetry(transpose=False, flip_x=True, flip_y=False)

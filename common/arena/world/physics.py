@@ -7,7 +7,8 @@ back_off_frames, a robot that collided is driven straight backwards for that man
 its action. It may be blocked again meanwhile, which is not counted and does not prolong it.
 
 Invariants: after every move no two robots' centres are nearer than two radii, and no robot overlaps
-a wall or an obstacle (touching is allowed). The outcome does not depend on the robots' order.
+a wall or an obstacle (touching is allowed). The outcome does not depend on the robots' order. A
+robot whose pose is NaN is absent: it meets nothing and goes nowhere.
 Numbers are computed as pymunk does, to the same bits (mrcdrl.common.arena.world.pymunk_physics).
 """
 
@@ -28,13 +29,14 @@ class Physics(Protocol):
 
     @property
     def robots(self) -> Float64Array:
-        """Poses [A, K, 3]; read-only."""
+        """Poses [A, K, 3], NaN of those that are absent; read-only."""
         ...
 
     def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
-        """Puts an arena's robots at the poses [K, 3] and forgets their collisions.
+        """Puts an arena's first robots at the poses [..., 3] and forgets their collisions.
 
-        obstacles: fixed discs [O, 3]. Raises ValueError if a robot overlaps anything.
+        Any others are absent. obstacles: fixed discs [O, 3]. Raises ValueError if a robot overlaps
+        anything.
         """
         ...
 
@@ -65,7 +67,8 @@ class ArrayPhysics:
 
     def place(self, arena: int, robots: Float64Array, obstacles: Float64Array) -> None:
         check_placed(self._config, robots, obstacles)
-        self._robots[arena] = robots
+        self._robots[arena] = np.nan
+        self._robots[arena, : len(robots)] = robots
         self._obstacles[arena] = obstacles
         self._back_off[arena] = 0
 
@@ -94,7 +97,7 @@ class ArrayPhysics:
 
 
 def check_placed(config: ArenaConfig, robots: Float64Array, obstacles: Float64Array) -> None:
-    """Raises ValueError if a robot at the poses [K, 3] overlaps anything."""
+    """Raises ValueError if a robot at the poses [..., 3] overlaps anything."""
     bounds, radius = reachable_px(config), config.robot_radius_px
     i, problem = _first_misplaced(robots, bounds, radius, inner_walls(config), obstacles)
     if problem:

@@ -15,6 +15,7 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import BoolArray, Float64Array, Int64Array, UInt8Array
 
 Pose = tuple[float, float, float]
+_ABSENT: Pose = (math.nan, math.nan, math.nan)
 
 
 class PymunkPhysics:
@@ -57,6 +58,7 @@ class World:
         self._space.add(*self._bodies, *self._shapes)
         self._poses: list[Pose] = [(0.0, 0.0, 0.0)] * num_robots
         self._back_off = [0] * num_robots
+        self._present = range(num_robots)
 
     @property
     def robots(self) -> Float64Array:
@@ -69,18 +71,22 @@ class World:
         self._space.remove(*self._obstacles)
         self._obstacles = [pymunk.Circle(self._still, r, (x, y)) for x, y, r in obstacles.tolist()]
         self._space.add(*self._obstacles)
-        self._poses = [(x, y, heading) for x, y, heading in robots.tolist()]
+        self._space.remove(*(self._shapes[i] for i in self._present))
+        self._present = range(len(robots))
+        self._space.add(*(self._shapes[i] for i in self._present))
+        absent = [_ABSENT] * (len(self._bodies) - len(robots))
+        self._poses = [(x, y, heading) for x, y, heading in robots.tolist()] + absent
         self._back_off = [0] * len(self._poses)
 
     def move(self, actions: UInt8Array, failed: BoolArray) -> tuple[BoolArray, BoolArray]:
         """Moves this arena's robots and returns masks [K], as Physics.move does."""
-        waiting = set(np.flatnonzero(~failed).tolist())
+        waiting = {i for i in self._present if not failed[i]}
         turned, proposals = self._poses.copy(), self._poses.copy()
         for i in waiting:
             turned[i] = self._turn(i, int(actions[i]))
             proposals[i] = self._advance(i, turned[i])
-        for i, proposal in enumerate(proposals):
-            self._put(i, proposal)
+        for i in self._present:
+            self._put(i, proposals[i])
         beyond = {i for i in waiting if self._meets_fixed(i)}
         blocked: set[int] = set()
         while hits := {i for i in waiting if self._space.shape_query(self._shapes[i])}:

@@ -20,7 +20,8 @@ def frame_rewards(
 
     scene: all the arenas [N, ...], after the frame's moves. collided, failed: [N, K]. frames: the
     paper's f [N], 1 after the first move. A robot that collided gets collision_reward wherever it
-    is; one that failed is rewarded like any other, and success does not wait for it.
+    is; one that failed is rewarded like any other, and success does not wait for it. One that is
+    absent, with a pose of NaN, gets 0; it must count as failed.
     """
     rewards = np.empty(collided.shape, np.float32)
     success = np.empty(len(collided), np.bool_)
@@ -71,32 +72,40 @@ def _reward_all(  # type: ignore[no-untyped-def]
     success_reward, collision_reward, step_reward = reward_values
     num_robots, num_targets = robots.shape[1], targets.shape[1]
     distances = np.empty((num_robots, num_targets), np.float64)
+    nearest = np.empty(num_robots, np.float64)
     for n in range(len(robots)):
         for i in range(num_robots):
+            nearest[i] = np.inf
             for j in range(num_targets):
                 across = robots[n, i, 0] - targets[n, j, 0]
                 along = robots[n, i, 1] - targets[n, j, 1]
                 distances[i, j] = math.sqrt(across * across + along * along)
-        success[n] = not collided[n].any() and _all_on_distinct_targets(distances, delta, failed[n])
+                if distances[i, j] < nearest[i]:  # not that of an absent target
+                    nearest[i] = distances[i, j]
+        success[n] = not collided[n].any() and _all_on_distinct_targets(
+            distances, nearest, delta, failed[n]
+        )
         frames_left = 1 - min(frames[n], f_max) / f_max
         for i in range(num_robots):
-            nearest = distances[i].min()
-            if success[n]:
+            if math.isnan(robots[n, i, 0]):
+                rewards[n, i] = 0.0
+            elif success[n]:
                 rewards[n, i] = success_reward
             elif collided[n, i]:
                 rewards[n, i] = collision_reward
-            elif nearest < reach:
-                rewards[n, i] = (1 - nearest / reach) * proximity + frames_left * (1 - proximity)
+            elif nearest[i] < reach:
+                closeness = 1 - nearest[i] / reach
+                rewards[n, i] = closeness * proximity + frames_left * (1 - proximity)
             else:
                 rewards[n, i] = step_reward
 
 
 @compiled
-def _all_on_distinct_targets(distances, delta, failed):  # type: ignore[no-untyped-def]
+def _all_on_distinct_targets(distances, nearest, delta, failed):  # type: ignore[no-untyped-def]
     """Whether every working robot [K] can be given its own target [M] nearer than delta."""
     num_robots, num_targets = distances.shape
     for robot in range(num_robots):
-        if not failed[robot] and distances[robot].min() >= delta:
+        if not failed[robot] and nearest[robot] >= delta:
             return False
     owners = np.full(num_targets, -1, np.int64)
     tried = np.empty(num_targets, np.bool_)

@@ -34,7 +34,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Poses of K robots, positions of M targets, and O obstacles."""
+    """Poses of K robots, positions of M targets, and O obstacles; NaN of what is absent."""
 
     robots: Float64Array  # [K, 3], x px, y px, heading rad
     targets: Float64Array  # [M, 2], x px, y px

@@ -471,3 +471,58 @@ def test_the_environment_counts_in_a_service_that_joins() -> None:
 def test_certificates_are_given_together(name: str) -> None:
     with pytest.raises(ConfigError, match="give ca, certificate and key together"):
         load_transport({f"transport.{name}": "file.pem"}, environ={})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "num_robots", "robots"),
+    [
+        ({}, 4, (1, 2, 3, 4)),
+        ({"arena.num_robots": "3"}, 3, ()),
+        ({"arena.robots": "[1, 6]"}, 6, (1, 6)),
+        ({"arena.num_robots": "2", "arena.robots": "[2]"}, 2, (2,)),
+    ],
+)
+def test_of_num_robots_and_robots_the_one_given_last_counts(
+    overrides: dict[str, str], num_robots: int, robots: tuple[int, ...]
+) -> None:
+    loaded = load("curriculum", overrides).arena
+    assert (loaded.num_robots, loaded.robots) == (num_robots, robots)
+    assert loaded.numbers == (robots or (num_robots,))
+    assert apply_overrides(tomllib.loads(to_toml(load("curriculum", overrides))), {}, {}).arena == (
+        loaded
+    ), "a run's file names both"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[arena]\nrobots = [4, 1]", "robots [4, 1] do not rise"),
+        ("[arena]\nrobots = [0, 1]", "rise from 1 or more"),
+        ("[arena]\nrobots = [1, 11]", "arena.num_robots: must be between 1 and 10 (given 11)"),
+        ("[arena]\nrobots = 4", "arena.robots: must be a list, such as [1]"),
+        ("[arena]\nnum_robots = 3\nrobots = [1, 4]", "num_robots 3 is not the last of robots"),
+        (
+            "[arena]\nrobots = [1, 2]\ntargets_px = [[100, 100], [300, 300]]",
+            "targets_px has the same 2 targets for each of robots [1, 2]: set num_targets too",
+        ),
+        (
+            '[arena]\nrobots = [1, 2]\nkind = "counting"\ncodec = "frames"',
+            'kind = "counting" needs a fixed number of robots',
+        ),
+        (
+            "[arena]\nrobots = [1, 2]\n[curriculum]\nschedule = [[0, 1]]",
+            "curriculum.schedule needs points of a learner step and a weight for each",
+        ),
+        ("[curriculum]\nschedule = [[5, 1]]", "schedule needs points whose steps rise from 0"),
+        ("[curriculum]\nschedule = [[0, 0]]", "a point without one above 0"),
+        ("[curriculum]\nschedule = [[0, -1]]", "schedule has a weight below 0"),
+        (
+            "[arena]\nrobots = [1, 2]\n[run]\nturn_size = 16",
+            "run.turn_size 16 needs one number of robots (arena.robots)",
+        ),
+    ],
+)
+def test_numbers_of_robots_that_make_no_sense_are_refused(
+    write: Any, text: str, reason: str
+) -> None:
+    assert reason in refusal(write(text))

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mrcdrl.common.arena import (
+    ArenaBatch,
     CountingBatch,
     counting_frames,
     counting_outcome,
@@ -261,3 +262,40 @@ def test_priorities_are_the_td_errors_of_the_values_acted_by(collected: Collecte
             error = abs(target - now[chunk.actions[t]])
             assert chunk.priorities[t] == pytest.approx(error, rel=1e-4, abs=1e-5)
     assert {len(chunk.priorities) for chunk in collected.chunks} == {0}
+
+
+def test_absent_robots_bear_no_transitions() -> None:
+    all_rewards_are_1 = dict.fromkeys(("success_reward", "collision_reward", "step_reward"), 1.0)
+    all_rewards_are_1 |= {"proximity_weight": 0, "f_max": 10**9}
+    config = Config.model_validate(
+        {
+            "arena": {"robots": [1, 3], "max_frames": 12, "view_px": VIEW_PX, **all_rewards_are_1},
+            "curriculum": {"schedule": [[0, 1, 9]]},
+        }
+    )
+    policy = WatchedPolicy(Policy(make_network()))
+    chunking = ChunkerConfig("actor-0", 5, 0.99, 1, STACK, 5)
+    arenas = ArenaBatch(config.arena, [np.random.default_rng(i) for i in range(ARENAS)])
+    collector = Collector(
+        config,
+        chunking,
+        arenas,
+        make_codec(config.arena),
+        policy,  # type: ignore[arg-type]
+        np.random.default_rng(0),
+    )
+    transitions, expected, numbers = 0, 0, set()
+    for step in range(60):
+        present = arenas.present.copy()
+        numbers |= set(present.tolist())
+        expected += int(present.sum())
+        chunks, summaries = collector.step(EPSILONS, truncate=step == 59)
+        assert len(policy.seen[-1]) == present.sum(), "only those that are there are acted for"
+        assert all(policy.seen[-1].reshape(present.sum(), -1).any(axis=1))
+        transitions += sum(map(len, chunks))
+        for chunk in chunks:
+            assert np.isfinite(chunk.records.view("<f4")[:, :3]).all()
+        for summary in summaries:
+            assert summary.score == pytest.approx(summary.frames), "a mean over those there"
+    assert numbers == {1, 3}
+    assert transitions == expected == collector.robot_steps < 60 * collector.num_robots
