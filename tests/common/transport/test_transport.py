@@ -35,6 +35,7 @@ from mrcdrl.common.transport import (
     free_endpoint,
 )
 from mrcdrl.common.transport.keys import Keys
+from mrcdrl.common.transport.publications import QueueSubscriber
 from tests.patience import PATIENCE_S
 
 KEY = "mrcdrl/test/query"
@@ -367,6 +368,31 @@ def test_the_queue_keeps_the_order_and_counts_what_it_drops(network: Network) ->
     assert subscriber.take(PATIENCE_S) == ("mrcdrl/test/queue/a", b"later")
     assert subscriber.take(0.0) is None
     assert subscriber.take(0.01) is None
+
+
+class Arriving(bytes):
+    """A publication as Zenoh hands it over."""
+
+    key_expr = KEY
+
+    @property
+    def payload(self) -> "Arriving":
+        return self
+
+    def to_bytes(self) -> bytes:
+        return bytes(self)
+
+
+def test_what_arrives_while_a_queue_is_drained_waits_for_the_next_time() -> None:
+    """A peer that floods keeps nobody who reads from other work."""
+    waiting = QueueSubscriber(100, capacity=10)
+    waiting.offer(Arriving(b"first"))
+    taken = []
+    for item in waiting.drain():
+        taken.append(item)
+        waiting.offer(Arriving(b"more"))
+    assert taken == [(KEY, b"first")]
+    assert waiting.take(0.0) == (KEY, b"more")
 
 
 def test_a_publication_that_is_too_large_is_counted_and_dropped(small_network: Network) -> None:
