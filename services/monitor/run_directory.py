@@ -101,7 +101,7 @@ class RunDirectory(Closing):
     def resumed_config(path: Path, overrides: dict[str, str]) -> tuple[Config, Config]:
         """What a run was made with, and what it would be resumed with; nothing is written.
 
-        Raises RunDirectoryError if it is no run, or a setting changes that has to stay.
+        Raises RunDirectoryError if it is not a run, or a setting changes that has to stay.
         """
         file = path / RUN_CONFIG
         if not file.is_file():

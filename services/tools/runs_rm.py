@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _check(path: Path) -> None:
-    """Raise RunDirectoryError for what is no run, or not one that stands alone."""
+    """Raise RunDirectoryError for what is not a run, or not one that stands alone."""
     if path.is_symlink():
         raise RunDirectoryError(f"{path} is a link; remove it and the run by their own paths")
     if path.with_name(f"{path.name}.toml").exists():
