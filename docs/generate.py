@@ -10,9 +10,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
-
-from pydantic.fields import FieldInfo
+from typing import Any
 
 from mrcdrl.common.config import (
     Config,
@@ -22,6 +20,7 @@ from mrcdrl.common.config import (
     sections,
     to_toml,
 )
+from mrcdrl.common.config.settings import Setting, all_settings
 from mrcdrl.services.tools.simulate import scaling
 from mrcdrl.services.tools.simulate.scaling import Pace
 
@@ -32,8 +31,6 @@ _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.S)
 _RATE = 4300.0  # robot steps per second of an actor with a dedicated core: docs/profile.md
 _UPDATES = 81.4  # per second, by a learner on two cores: benchmarks/results/learner
 _ACTORS = (10, 100, 1000)
-_SOURCE = re.compile(r"^(?P<text>.*?)\s*\((?P<source>[^()]*)\)$")
-_BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 _HEAD = """# Configuration
 
@@ -53,7 +50,8 @@ the file, which beats the default below:
 - Values of flags and variables are TOML; anything that is not TOML is read as a string.
 - An unknown name is refused with the nearest known one, an impossible value with the reason. So is
   a variable with an underscore too few, such as `MRCDRL_LEARNER_BATCH_SIZE`. Numbers are finite.
-- `mrcdrl config` takes the same flags and prints the resolved configuration. A run keeps its own in
+- `mrcdrl config` takes the same flags and prints the resolved configuration; with `--explain KEY`,
+  what one setting means, its value and where that comes from. A run keeps its own in
   `runs/NAME/config.toml`, which `--resume` reads.
 - A process that joins a run takes the run's configuration from the replay service, and applies its
   own flags over it. `[transport]` is the exception: it concerns one process, which takes it from
@@ -77,9 +75,12 @@ def render() -> str:
         title = re.sub(r"\s+", " ", model.__doc__ or "").strip()
         parts.append(f"\n## [{section}]\n\n{title}\n\n")
         parts.append("| setting | default | allowed | meaning | source |\n|---|---|---|---|---|\n")
-        for name, info in model.model_fields.items():
-            text, source = described(f"{section}.{name}", info)
-            cells = (f"`{name}`", f"`{shown[section, name]}`", _allowed(info), text, source)
+        for setting in (s for s in all_settings() if s.section == section):
+            if not (setting.meaning and setting.source):
+                raise ValueError(f"{setting.key}: say what it means, and its source in brackets")
+            default = shown[section, setting.name]
+            texts = (_allowed(setting), _cell(setting.meaning), _cell(setting.source))
+            cells = (f"`{setting.name}`", f"`{default}`", *texts)
             parts.append("| " + " | ".join(cells) + " |\n")
     parts.append(_presets(defaults))
     return "".join(parts)
@@ -96,15 +97,6 @@ def _head_page() -> str:
     )
 
 
-def described(name: str, info: FieldInfo) -> tuple[str, str]:
-    """A setting's meaning and source; raises ValueError if it has no source."""
-    flat = re.sub(r"\s+", " ", info.description or "").strip()
-    match = _SOURCE.match(flat)
-    if match is None:
-        raise ValueError(f"{name}: its description ends without a source in brackets: {flat!r}")
-    return _cell(match["text"]) or "–", _cell(match["source"])
-
-
 def _shown(toml: str) -> dict[tuple[str, str], str]:
     """Values as TOML text, by (section, field)."""
     values: dict[tuple[str, str], str] = {}
@@ -118,26 +110,9 @@ def _shown(toml: str) -> dict[tuple[str, str], str]:
     return values
 
 
-def _allowed(info: FieldInfo) -> str:
+def _allowed(setting: Setting) -> str:
     """The type and limits, or the possible words."""
-    kind = info.annotation
-    if get_origin(kind) is Literal:
-        return ", ".join(f"`{choice}`" for choice in get_args(kind))
-    limits = [
-        f"{sign} {getattr(bound, name):g}"
-        for bound in info.metadata
-        for name, sign in _BOUNDS.items()
-        if hasattr(bound, name)
-    ]
-    return ", ".join([_type_name(kind), *limits])
-
-
-def _type_name(kind: Any) -> str:
-    if get_origin(kind) is tuple:
-        inner = [a for a in get_args(kind) if a is not Ellipsis]
-        names = ", ".join(_type_name(a) for a in inner)
-        return f"list of {names}" if Ellipsis in get_args(kind) else f"[{names}]"
-    return {int: "integer", float: "number", str: "text", bool: "`true`, `false`"}[kind]
+    return ", ".join(f"`{choice}`" for choice in setting.choices) or setting.allowed
 
 
 def _presets(defaults: dict[str, dict[str, Any]]) -> str:

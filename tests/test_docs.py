@@ -398,7 +398,7 @@ def test_the_pages_to_start_from_are_linked() -> None:
 
 def test_every_command_is_in_the_readme() -> None:
     described = {name.removeprefix("mrcdrl ") for name in names(part(README, "## Commands"))}
-    assert described == set(cli._COMMANDS)
+    assert described == set(cli.COMMANDS)
 
 
 def command_lines() -> list[str]:
@@ -409,15 +409,11 @@ def command_lines() -> list[str]:
 
 
 @pytest.mark.parametrize("line", command_lines())
-def test_command_and_its_flags_exist(line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words = line.split()[1:]
-    name = " ".join(words[:2]) if " ".join(words[:2]) in cli._COMMANDS else words[0]
-    assert name in cli._COMMANDS
-    command = importlib.import_module(cli._COMMANDS[name][0])
-    with pytest.raises(SystemExit) as ended:
-        command.main(["--help"])
-    assert ended.value.code == 0
-    known = set(re.findall(r"--[a-z][\w.-]*", capsys.readouterr().out))
+def test_command_and_its_flags_exist(line: str) -> None:
+    name, _ = cli.split(line.split()[1:])
+    assert name in cli.COMMANDS
+    parser = cli.COMMANDS[name].parser()
+    known = {word for action in parser._actions for word in action.option_strings}
     assert set(re.findall(r"--[a-z][\w.-]*", line)) <= known
 
 

@@ -7,7 +7,6 @@ Invariant: an unknown name is refused, and the nearest known one suggested.
 import difflib
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import resources
@@ -17,6 +16,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from mrcdrl.common.config.schema import Config, TransportConfig, sections
+from mrcdrl.common.config.settings import limits
 from mrcdrl.common.config.toml import from_toml
 from mrcdrl.common.errors import ConfigError
 
@@ -32,7 +32,6 @@ _TYPES = {
     "bool": "must be true or false",
     "string": "must be text",
 }
-_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
 def preset_names() -> list[str]:
@@ -47,8 +46,17 @@ def _unknown(name: str, known: Sequence[str], what: str, where: str) -> ConfigEr
     return ConfigError(f"{where}: unknown {what} {name!r}{hint}")
 
 
-def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The table of a preset or file, merged over those that it extends.
+def _read_toml(source: str) -> dict[str, Any]:
+    """The table of a preset or file, merged over those that it extends."""
+    merged: dict[str, Any] = {}
+    for _, table in _layers(source):
+        for section, values in table.items():
+            merged[section] = _merged(merged.get(section, {}), values)
+    return merged
+
+
+def _layers(source: str, above: tuple[str, ...] = ()) -> list[tuple[str, dict[str, Any]]]:
+    """The names and tables of a preset or file and of those that it extends, the lowest first.
 
     above: the files that extend this one.
     """
@@ -71,13 +79,12 @@ def _read_toml(source: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
     base = table.pop(EXTENDS, None)
     _check_names(table, f"config {source!r}")
     if base is None:
-        return table
+        return [(source, table)]
     if base not in preset_names():
         base = str(path.parent / str(base))
     if base in (*above, source):
         raise ConfigError(f"config {source!r} extends itself via {', '.join((*above, source))}")
-    below = _read_toml(base, (*above, source))
-    return below | {name: _merged(below.get(name, {}), values) for name, values in table.items()}
+    return [*_layers(base, (*above, source)), (source, table)]
 
 
 def _merged(below: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -183,6 +190,32 @@ def load_config(
     return apply_overrides(table, overrides or {}, environ)
 
 
+def origin(
+    key: str,
+    source: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+    environ: Mapping[str, str] | None = None,
+) -> str:
+    """Where `load_config` gets the value of a setting from: a flag, a variable, a file.
+
+    Arguments besides the setting's name, and errors, are those of `load_config`.
+    """
+    section, name = key.split(".")
+    if key in (overrides or {}):
+        return "a flag"
+    if key in environment_overrides(os.environ if environ is None else environ):
+        return f"the environment, {variable(section, name)}"
+    for layer, table in reversed([] if source is None else _layers(source)):
+        if name in table.get(section, {}):
+            return source_name(layer)
+    return "its default"
+
+
+def source_name(source: str) -> str:
+    """A preset or file, as help and messages call it."""
+    return f"preset {source}" if source in preset_names() else source
+
+
 def load_transport(
     overrides: Mapping[str, str],
     environ: Mapping[str, str] | None = None,
@@ -270,15 +303,4 @@ def _requirement(path: Sequence[str | int], error: Mapping[str, Any]) -> str:
     if kind not in ("greater", "less"):
         message: str = error["msg"].removeprefix("Value error, ")
         return _TYPES.get(kind) or message.replace("Input should be", "must be")
-    bounds = sections()[str(path[0])].model_fields[str(path[1])].metadata
-    limits = " and ".join(
-        f"{words} {_number(getattr(bound, name))}"
-        for bound in bounds
-        for name, words in _LIMITS.items()
-        if hasattr(bound, name)
-    )
-    return "must be " + re.sub("at least (.*) and at most", r"between \1 and", limits)
-
-
-def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
+    return f"must be {limits(sections()[str(path[0])].model_fields[str(path[1])])}"

@@ -86,11 +86,11 @@ class ArenaConfig(Section):
     wall_offset_px: Annotated[float, Field(ge=0)] = 10
     """Distance from the border to the wall's outer face. (paper)"""
     wall_thickness_px: Positive = 2
-    """(paper)"""
+    """Thickness of the walls. (paper)"""
     robot_radius_px: Positive = 25
-    """c_r. (paper)"""
+    """Radius of a robot, c_r. (paper)"""
     target_size_px: Positive = 30
-    """s_w = s_h, sides of a square target. (paper)"""
+    """Side of a square target, s_w = s_h. (paper)"""
     turn_deg: Annotated[float, Field(ge=0.1, lt=180)] = 23
     """Angle that a `left` or `right` action turns. (paper)"""
     step_px: Positive = 2.5
@@ -122,7 +122,7 @@ class ArenaConfig(Section):
     success_reward: Reward = 200
     """Reward to each robot. (paper)"""
     collision_reward: Reward = -5
-    """(paper)"""
+    """Reward for a collision. (paper)"""
     step_reward: Reward = 0.03
     """Reward off target and without a collision. (paper)"""
     proximity_weight: Fraction = 0.7
@@ -264,9 +264,10 @@ class AgentConfig(Section):
     """The network and its update (paper sections 4 and 5.2)."""
 
     kind: Annotated[Literal["duel", "ddqn", "dqn"], Kept()] = "duel"
-    """`dqn`: target (4). `ddqn`: target (2). `duel`: target (2) and two streams (1). (paper)"""
+    """`duel`: double DQN, target (2), with the two streams (1). `ddqn`: double DQN. `dqn`: DQN,
+    target (4). (paper)"""
     gamma: Annotated[float, Field(gt=0, lt=1), Kept()] = 0.99
-    """(paper)"""
+    """Discount of rewards for each step that they are away. (paper)"""
     n_step: Annotated[int, Field(ge=1, le=32), Kept()] = 1
     """Rewards summed before the bootstrap. (paper: 1; Ape-X: 3)"""
     shaping_per_px: Annotated[float, Field(ge=0, le=1000), Kept()] = 0.0
@@ -293,9 +294,9 @@ class AgentConfig(Section):
     """Temperature times log-probability, or the advantage, counts as no less than minus this, in
     scaled rewards. (Munchausen paper; advantage learning: never)"""
     optimizer: Annotated[Literal["adam", "rmsprop"], Kept()] = "adam"
-    """(ours; ancestor: rmsprop)"""
+    """Optimizer of the gradient step. (ours; ancestor: rmsprop)"""
     learning_rate: Positive = 1e-4
-    """(ours)"""
+    """Step size of the optimizer. (ours)"""
     learning_rate_schedule: Schedule = ((0, 1.0),)
     """Points (learner step, factor of learning_rate), linear between, constant after the last.
     (ours)"""
@@ -461,7 +462,7 @@ class LearnerConfig(Section):
     """Learning from samples."""
 
     batch_size: Annotated[Count, Kept(in_lockstep=True)] = 32
-    """(paper)"""
+    """Transitions in a mini-batch. (paper)"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of convolutions and hidden layers; heads and loss are always float32. `auto`:
     bfloat16 where the processor supports it. (ours)"""
@@ -522,7 +523,7 @@ class EvaluatorConfig(Section):
     episodes: Count = 100
     """Episodes of each evaluation; the paper's table has 1100. (ours)"""
     epsilon: Fraction = 0.01
-    """(paper)"""
+    """Probability of a random action in the test. (paper)"""
     period_s: Pause = 30.0
     """Least time between the starts of two evaluations. (ours)"""
     max_share: Annotated[float, Field(gt=0, le=1)] = 0.5

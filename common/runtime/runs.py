@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
+from mrcdrl.common.runtime.completion import completed_by
 from mrcdrl.common.runtime.files import METRICS, RUN_CONFIG, WEIGHTS_SUFFIX
 from mrcdrl.common.runtime.names import check_name
 
@@ -22,8 +23,12 @@ _MARKS = (RUN_CONFIG, METRICS, "checkpoints", "replay/[0-9]*")  # a run has one 
 def add_run(parser: argparse.ArgumentParser, text: str = "the run") -> None:
     """Add the argument that names a run, also as --run, and --run-dir."""
     named = f"{text}: its name, its path, or {LATEST}"
-    parser.add_argument("run", nargs="?", default=argparse.SUPPRESS, metavar="RUN", help=named)
-    parser.add_argument("--run", default=None, metavar="RUN", help="the same as RUN")
+    run = parser.add_argument(
+        "run", nargs="?", default=argparse.SUPPRESS, metavar="RUN", help=named
+    )
+    flag = parser.add_argument("--run", default=None, metavar="RUN", help="the same as RUN")
+    for action in (run, flag):
+        completed_by(action, run_names)
     add_run_dir(parser)
 
 
@@ -118,6 +123,12 @@ def run_paths(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.is_dir() and is_run(path))
+
+
+def run_names(_typed: str = "") -> list[str]:
+    """Words that name a run here, as a shell completes them."""
+    names = [run.name for run in run_paths(runs_folder())]
+    return [*names, LATEST] if names else []
 
 
 def active_s(run: Path) -> float:

@@ -18,7 +18,13 @@ from mrcdrl.common.config import (
     load_transport,
     validate_config,
 )
-from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transport_flag, overrides
+from mrcdrl.common.config.arguments import (
+    SEEDS,
+    Parser,
+    add_config_flags,
+    add_transport_flag,
+    overrides,
+)
 from mrcdrl.common.errors import (
     ConfigError,
     DeadlineError,
@@ -33,6 +39,23 @@ from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 
 ENDPOINT_FILE = "endpoint"
+_SHOWN = {  # in the short help of a service
+    "actor": ("actor.num_arenas", "actor.threads", "actor.device", "actor.spool_chunks"),
+    "learner": (
+        "learner.device",
+        "learner.threads",
+        "learner.precision",
+        "learner.publish_period",
+        "learner.checkpoint_period_s",
+    ),
+    "evaluator": (
+        "evaluator.episodes",
+        "evaluator.epsilon",
+        "evaluator.period_s",
+        "evaluator.max_share",
+        "evaluator.threads",
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +71,7 @@ class Joining:
     @classmethod
     def from_argv(cls, role: str, argv: Sequence[str]) -> Self:
         """Parse a service's command line; raises UnreachableError as `from_arguments`."""
-        parser = joining_parser(role, f"Start the {role} of a run that is up.")
-        return cls.from_arguments(parser.parse_args(argv))
+        return cls.from_arguments(service_parser(role).parse_args(argv))
 
     @classmethod
     def from_arguments(cls, arguments: argparse.Namespace) -> Self:
@@ -73,14 +95,36 @@ class Joining:
         return Keys(self.run)
 
 
+def actor_parser() -> Parser:
+    """The flags of `mrcdrl actor`."""
+    return service_parser("actor")
+
+
+def learner_parser() -> Parser:
+    """The flags of `mrcdrl learner`."""
+    return service_parser("learner")
+
+
+def evaluator_parser() -> Parser:
+    """The flags of `mrcdrl evaluator`."""
+    return service_parser("evaluator")
+
+
+def service_parser(role: str) -> Parser:
+    """The flags of an actor, learner or evaluator."""
+    seeds = ("evaluator.seed",) if role == "evaluator" else SEEDS
+    parser = joining_parser(role, f"Start the {role} of a run that is up.")
+    add_config_flags(parser, _SHOWN[role], seeds=seeds)
+    return parser
+
+
 def joining_parser(command: str, description: str) -> Parser:
-    """The flags of a command that joins a run."""
+    """The flags of a command that joins a run, without those of settings."""
     parser = Parser(prog=f"mrcdrl {command}", description=description)
     add_run(parser)
     parser.add_argument("--connect", action="append", help="endpoint, such as tcp/HOST:7447")
     parser.add_argument("--id", help="this worker's name; default: from the host and process")
     add_transport_flag(parser)
-    add_config_flags(parser)
     return parser
 
 

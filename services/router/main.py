@@ -15,21 +15,7 @@ _TICK_S = 1.0
 
 def main(argv: Sequence[str]) -> int:
     """Relay until told to stop; return the exit code."""
-    parser = Parser(prog="mrcdrl router", description="Relay between the processes of runs.")
-    parser.add_argument(
-        "--config", type=Path, default=ROUTER_FILE, help="a file such as configs/router.json5"
-    )
-    parser.add_argument(
-        "--listen",
-        action="append",
-        help="endpoint, such as tcp/0.0.0.0:7447; default: the file's",
-    )
-    parser.add_argument(
-        "--connect", action="append", help="another router's endpoint, linked to once it is up"
-    )
-    add_transport_flag(parser)
-    add_config_flags(parser, only=("transport",))
-    arguments = parser.parse_args(argv)
+    arguments = parser().parse_args(argv)
     given = load_transport(overrides(arguments), source=arguments.transport)
     transport = given.model_copy(
         update={
@@ -47,3 +33,30 @@ def main(argv: Sequence[str]) -> int:
             heartbeat.worked()
             heartbeat.beat()
     return 0
+
+
+def parser() -> Parser:
+    """The command's flags."""
+    made = Parser(prog="mrcdrl router", description="Relay between the processes of runs.")
+    made.add_argument(
+        "--config",
+        metavar="FILE",
+        type=Path,
+        default=ROUTER_FILE,
+        help="Zenoh's own; default: the installed router.json5",
+    )
+    made.add_argument(
+        "--listen",
+        metavar="ENDPOINT",
+        action="append",
+        help="such as tcp/0.0.0.0:7447; default: the file's",
+    )
+    made.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        action="append",
+        help="another router, linked to once it is up",
+    )
+    add_transport_flag(made)
+    add_config_flags(made, only=("transport",))
+    return made

@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from mrcdrl.common.config import Config
-from mrcdrl.common.config.arguments import Parser
+from mrcdrl.common.config.arguments import Parser, add_config_flags
 from mrcdrl.common.errors import DeadlineError, RunDirectoryError, UnreachableError
 from mrcdrl.common.runtime.files import METRICS
 from mrcdrl.common.runtime.heartbeat import Heartbeat
@@ -165,6 +165,7 @@ def parser() -> Parser:
         action="store_true",
         help="keep the records that `mrcdrl train` would, until stopped",
     )
+    add_config_flags(made)
     return made
 
 

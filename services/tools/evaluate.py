@@ -11,37 +11,21 @@ import time
 from collections.abc import Sequence
 
 from mrcdrl.common.arena import test_starts
-from mrcdrl.common.config.arguments import whole_number
 from mrcdrl.common.messages.trajectory import Evaluation
 from mrcdrl.services.evaluator.navigation import Navigation, navigation, navigation_table
 from mrcdrl.services.evaluator.score import evaluation
 from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.failure_summary import as_json, failure_table, summarize
 from mrcdrl.services.tools.failures import Failure
 from mrcdrl.services.tools.progress import Done, Progress
 from mrcdrl.services.tools.replays import failures_of, num_replays
-from mrcdrl.services.tools.subject import (
-    Subject,
-    always,
-    parse_with_episodes,
-    subject,
-    subject_parser,
-)
+from mrcdrl.services.tools.subject import Subject, always, subject
 
 
 def main(argv: Sequence[str]) -> int:
     """Evaluate and print; return the exit code."""
-    parser = subject_parser("evaluate", "The paper's test: one collision fails, epsilon 0.01.")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument(
-        "--failures",
-        nargs="?",
-        type=whole_number(0),
-        const=sys.maxsize,
-        metavar="N",
-        help="describe the first N failures (without N: all), and what share failed in which way",
-    )
-    arguments = parse_with_episodes(parser, argv, 1100)
+    arguments = flags.evaluate().parse_args(argv)
     evaluated = subject(arguments)
     with Progress() as progress:
         result, measures, episodes = evaluate(

@@ -22,8 +22,9 @@ from mrcdrl.common.model.policy import FrameStack, Policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import network_from_bytes
 from mrcdrl.common.runtime.files import atomic_write, prepare_output, reason
+from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.progress import Progress
-from mrcdrl.services.tools.subject import Subject, subject, subject_parser
+from mrcdrl.services.tools.subject import Subject, subject
 
 NAMES = ("observation", "q_values")  # uint8 [B, S, V, V], float32 [B, A]
 METADATA = "mrcdrl.json"
@@ -35,18 +36,17 @@ Run = Callable[[Tensor], Tensor]
 
 def main(argv: Sequence[str]) -> int:
     """Export, print the largest difference; return the exit code."""
-    parser = subject_parser("export", "Write weights for other programs, checked on real images.")
-    suffixes = ", ".join(FORMATS)
-    parser.add_argument("--out", type=Path, required=True, help=f"file to write: {suffixes}")
-    arguments = parser.parse_args(argv)
+    arguments = flags.export().parse_args(argv)
     if arguments.out.suffix not in FORMATS:
         extension = arguments.out.suffix
-        raise ConfigError(f"--out: unsupported extension {extension!r}; use {suffixes}")
+        raise ConfigError(f"--out: unsupported extension {extension!r}; use {', '.join(FORMATS)}")
     prepare_output(arguments.out)
     given = subject(arguments)
     with Progress() as progress:
         difference = export(given, arguments.out, progress)
-    print(f"{arguments.out}: {_STATES} states, largest difference from torch {difference:.2g}")
+    told = {"out": str(arguments.out), "states": _STATES, "largest_difference": difference}
+    text = f"{arguments.out}: {_STATES} states, largest difference from torch {difference:.2g}"
+    print(json.dumps(told) if arguments.json else text)
     return 0
 
 

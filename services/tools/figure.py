@@ -1,20 +1,13 @@
-"""`mrcdrl figure`: plot the paper's figures of any run, weights or controller.
-
-`arena`: Fig. 1, a start. `views`: Fig. 3, how a robot's image is made. `trajectories`: Fig. 8,
-episodes of one policy. `comparison`: Fig. 10, several policies from the same starts. `curves`:
-Fig. 7, successes of several runs over training.
-"""
+"""`mrcdrl figure`: plot the paper's figures of any run, weights or controller."""
 
 import argparse
 import copy
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from mrcdrl.common.arena import Scene, literal_views, make_codec, render_arena, test_starts
 from mrcdrl.common.config import ArenaConfig
-from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Float64Array, Outcome, UInt8Array
 from mrcdrl.common.runtime.files import prepare_output
@@ -30,14 +23,9 @@ from mrcdrl.services.plots.paper import (
     curves,
     sight,
 )
+from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.progress import Progress
-from mrcdrl.services.tools.subject import (
-    Subject,
-    add_arena_flags,
-    config_without_weights,
-    controlled,
-    subject,
-)
+from mrcdrl.services.tools.subject import Subject, config_without_weights, controlled, subject
 
 _ARENA_PX = 900
 _INTENSITY_WEIGHTS = (0.114, 0.587, 0.299)  # OpenCV's, for blue, green and red
@@ -51,39 +39,13 @@ _WORLD = (
 
 def main(argv: Sequence[str]) -> int:
     """Write the figure; return the exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = flags.figure().parse_args(argv)
     check_suffix(arguments.out, SUFFIXES)
     prepare_output(arguments.out)
     with Progress() as progress:
         _FIGURES[arguments.figure](arguments, progress)
     print(arguments.out)
     return 0
-
-
-def _parser() -> Parser:
-    parser = Parser(prog="mrcdrl figure", description=__doc__)
-    parser.add_argument("figure", choices=list(_FIGURES), help="which figure")
-    parser.add_argument(
-        "weights", nargs="*", help="runs (name, path, or latest) or .safetensors files"
-    )
-    parser.add_argument("--out", type=Path, required=True, help="the .png or .svg to write")
-    parser.add_argument(
-        "--controller",
-        action="append",
-        default=[],
-        help="in addition to weights, or instead of them",
-    )
-    parser.add_argument(
-        "--episodes", type=whole_number(1), help="episodes to show; default: 12, or 4 to compare"
-    )
-    parser.add_argument(
-        "--frame", type=whole_number(0), default=40, help="frame of the episode, for `views`"
-    )
-    parser.add_argument(
-        "--seed", type=whole_number(0), default=0, help="seed of the starts and the exploration"
-    )
-    add_arena_flags(parser)
-    return parser
 
 
 def _arena(arguments: argparse.Namespace, _progress: Progress) -> None:

@@ -9,21 +9,18 @@ from mrcdrl.common.runtime.files import prepare_output
 from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.figures import check_suffix
 from mrcdrl.services.plots.film import SUFFIXES, write_film
+from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.episode_frames import film_frames, num_film_frames
 from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.rerun_recording import SUFFIX, check_rerun, write_recording
-from mrcdrl.services.tools.subject import parse_with_episodes, subject, subject_parser
+from mrcdrl.services.tools.subject import subject
 
 FPS = 30
 
 
 def main(argv: Sequence[str]) -> int:
     """Write the film or recording; return the exit code."""
-    parser = subject_parser("render", "Make a film of evaluation episodes.")
-    parser.add_argument(
-        "--out", type=Path, default=Path("film.mp4"), help=f"the .mp4, .gif or {SUFFIX} to write"
-    )
-    arguments = parse_with_episodes(parser, argv, 4)
+    arguments = flags.render().parse_args(argv)
     check_suffix(arguments.out, (*SUFFIXES, SUFFIX))
     prepare_output(arguments.out)
     recorded = arguments.out.suffix == SUFFIX

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mrcdrl.common.config.arguments import Parser
-from mrcdrl.common.runtime.runs import add_run, find_run
+from mrcdrl.common.runtime.runs import find_run
 from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
 from mrcdrl.services.plots.paper import SUFFIXES
+from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.render import write_episodes
-from mrcdrl.services.tools.subject import subject, subject_parser
+from mrcdrl.services.tools.subject import subject
 
 _EPISODES = 12
 _FILMED = 4
@@ -18,9 +18,7 @@ _SEED = 0
 
 def main(argv: Sequence[str]) -> int:
     """Write the plots and the film; return the exit code."""
-    parser = Parser(prog="mrcdrl report", description="Write the plots and the film of a run.")
-    add_run(parser)
-    arguments = parser.parse_args(argv)
+    arguments = flags.report().parse_args(argv)
     run_dir = find_run(arguments.run, arguments.run_dir)
     files = plots(run_dir, "training")
     with Progress() as progress:
@@ -33,7 +31,7 @@ def main(argv: Sequence[str]) -> int:
 
 def draw_episodes(run_dir: Path, progress: Progress) -> None:
     """Plot and film episodes of the best weights; CheckpointError if the run has no weights."""
-    shown = subject(subject_parser("report", "").parse_args([str(run_dir)]))
+    shown = subject(flags.evaluate().parse_args([str(run_dir)]))
     arena = shown.config.arena
     results = shown.episodes(_EPISODES, _SEED, progress.stage("episodes", _EPISODES))
     paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]

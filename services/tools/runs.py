@@ -40,10 +40,7 @@ _STYLES = {
 
 def main(argv: Sequence[str]) -> int:
     """Print the runs; return the exit code."""
-    parser = Parser(prog="mrcdrl runs", description="Show the runs in a folder.")
-    add_run_dir(parser)
-    parser.add_argument("--json", action="store_true", help="as JSON, one object a line")
-    arguments = parser.parse_args(argv)
+    arguments = parser().parse_args(argv)
     folder = runs_folder(arguments.run_dir)
     found = sorted(map(run_info, run_paths(folder)), key=lambda run: run.active_s)
     if arguments.json:
@@ -97,3 +94,11 @@ def size_text(num_bytes: float) -> str:
             return f"{num_bytes:.0f} {unit}"
         num_bytes /= 1000
     return f"{num_bytes:.1f} GB"
+
+
+def parser() -> Parser:
+    """The command's flags."""
+    made = Parser(prog="mrcdrl runs", description="Show the runs in a folder.")
+    add_run_dir(made)
+    made.add_argument("--json", action="store_true", help="as JSON, one object a line")
+    return made

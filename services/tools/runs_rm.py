@@ -13,8 +13,9 @@ from pathlib import Path
 
 from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.errors import RunDirectoryError
+from mrcdrl.common.runtime.completion import completed_by
 from mrcdrl.common.runtime.files import lock_directory, reason
-from mrcdrl.common.runtime.runs import add_run_dir, find_run
+from mrcdrl.common.runtime.runs import add_run_dir, find_run, run_names
 from mrcdrl.services.monitor.run_directory import lockable
 from mrcdrl.services.monitor.run_info import RunInfo, config_of, run_info
 from mrcdrl.services.tools.runs import size_text, state_text
@@ -22,11 +23,7 @@ from mrcdrl.services.tools.runs import size_text, state_text
 
 def main(argv: Sequence[str]) -> int:
     """Remove the runs; return the exit code: 1 if the answer was no."""
-    parser = Parser(prog="mrcdrl runs rm", description="Remove runs, with all their files.")
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="its name, its path, or latest")
-    parser.add_argument("--yes", action="store_true", help="do not ask")
-    add_run_dir(parser)
-    arguments = parser.parse_args(argv)
+    arguments = parser().parse_args(argv)
     paths = list(dict.fromkeys(find_run(run, arguments.run_dir) for run in arguments.runs))
     with ExitStack() as held:
         for path in paths:
@@ -86,3 +83,13 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     except OSError as error:
         raise RunDirectoryError(f"{path} cannot be removed: {reason(error)}") from error
+
+
+def parser() -> Parser:
+    """The command's flags."""
+    made = Parser(prog="mrcdrl runs rm", description="Remove runs, with all their files.")
+    runs = made.add_argument("runs", nargs="+", metavar="RUN", help="its name, its path, or latest")
+    completed_by(runs, run_names)
+    made.add_argument("--yes", action="store_true", help="do not ask")
+    add_run_dir(made)
+    return made

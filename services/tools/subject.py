@@ -2,7 +2,7 @@
 
 import argparse
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,14 +10,14 @@ import numpy as np
 import torch
 
 from mrcdrl.common.arena import make_codec, test_starts
-from mrcdrl.common.arena.controllers import CONTROLLERS, check_controller, make_controller
+from mrcdrl.common.arena.controllers import check_controller, make_controller
 from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
+from mrcdrl.common.config.arguments import overrides
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.saved_policy import config_beside, policy_of, read_saved, weights_path
-from mrcdrl.common.runtime.runs import add_run_dir, find_weights
+from mrcdrl.common.runtime.runs import find_weights
 from mrcdrl.services.evaluator.trial import (
     ControllerPlayer,
     EpisodeResult,
@@ -62,35 +62,6 @@ class Subject:
             play(self.config.arena, starts, player, keep_paths=True, keep_going=always(report))
             or []
         )
-
-
-def subject_parser(command: str, description: str) -> Parser:
-    """Make a parser with the flags that name a subject."""
-    parser = Parser(prog=f"mrcdrl {command}", description=description)
-    parser.add_argument(
-        "weights", nargs="?", help="a run (its name, its path, or latest) or a .safetensors file"
-    )
-    parser.add_argument("--controller", help=f"instead of weights: {', '.join(CONTROLLERS)}")
-    add_arena_flags(parser)
-    return parser
-
-
-def parse_with_episodes(parser: Parser, argv: Sequence[str], num: int) -> argparse.Namespace:
-    """Add --episodes, by default `num`, and --seed; parse the flags."""
-    parser.add_argument(
-        "--episodes", type=whole_number(1), default=num, help=f"starts; default: {num}"
-    )
-    parser.add_argument(
-        "--seed", type=whole_number(0), default=0, help="of the starts and the exploration"
-    )
-    return parser.parse_args(argv)
-
-
-def add_arena_flags(parser: Parser) -> None:
-    """Add the flags that set the arena of a subject."""
-    parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
-    add_run_dir(parser)
-    add_config_flags(parser, {"arena.num_robots": "--robots"})
 
 
 def config_without_weights(arguments: argparse.Namespace) -> Config:

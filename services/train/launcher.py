@@ -4,7 +4,6 @@ Invariants: what no service could do is refused before anything is written; the 
 without its plots.
 """
 
-import argparse
 import contextlib
 import logging
 import os
@@ -17,12 +16,12 @@ from pathlib import Path
 
 from mrcdrl.common.arena import test_starts
 from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config.arguments import overrides
 from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.extras import require
 from mrcdrl.common.runtime.process import COMMAND, DIE_WITH_PARENT, StopSignal
-from mrcdrl.common.runtime.runs import add_run_dir, find_run, new_run_path
+from mrcdrl.common.runtime.runs import find_run, new_run_path
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display
@@ -32,6 +31,7 @@ from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule, stopped
 from mrcdrl.services.monitor.watching import Watching
+from mrcdrl.services.train.flags import parser
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.resuming import check_unfinished
 
@@ -42,12 +42,6 @@ _PLOTS_S = 300.0
 _JOIN_S = 60.0
 _ENOUGH_CORES = 4
 _KEYS = "Ctrl-C ends the run"
-_SHORT = {
-    "arena.num_robots": "--robots",
-    "run.minutes": "--minutes",
-    "run.learner_steps": "--learner-steps",
-    "run.actors": "--actors",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,23 +63,12 @@ def open_run(argv: Sequence[str]) -> RunDirectory:
 
 def plan_run(argv: Sequence[str]) -> Plan:
     """Read the command line, and refuse a run that is not possible; write nothing."""
-    parser = Parser(prog="mrcdrl train", description="Train on this machine, with all processes.")
-    parser.add_argument("--config", help=f"a preset or a TOML file; {DEFAULT_PRESET} by default")
-    parser.add_argument(
-        "name", nargs="?", default=argparse.SUPPRESS, metavar="NAME", help="the new run's name"
-    )
-    parser.add_argument("--name", help="the same; made of preset, robots and time by default")
-    parser.add_argument("--resume", metavar="RUN", help="go on with this run: name, path or latest")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="say what the run would be and take, and end"
-    )
-    add_run_dir(parser)
-    add_config_flags(parser, _SHORT)
-    arguments = parser.parse_args(argv)
+    made = parser()
+    arguments = made.parse_args(argv)
     given = overrides(arguments)
     if arguments.resume:
         if arguments.name or arguments.config:
-            parser.error("--resume keeps the run's name and configuration: no --name or --config")
+            made.error("--resume keeps the run's name and configuration: no --name or --config")
         return _resumption(
             find_run(arguments.resume, arguments.run_dir), given, dry_run=arguments.dry_run
         )

@@ -10,7 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from mrcdrl.common.config import Config, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
+from mrcdrl.common.config.arguments import (
+    Parser,
+    add_config_flag,
+    add_config_flags,
+    overrides,
+    whole_number,
+)
 from mrcdrl.common.runtime.files import RUN_CONFIG, prepare_output
 from mrcdrl.common.runtime.runs import add_run, find_run
 from mrcdrl.services.replay.inspect.contents import log_directory, read_contents
@@ -22,17 +28,7 @@ _BAR = 32
 
 def main(argv: Sequence[str]) -> int:
     """Read the log and show it; return the exit code."""
-    description = "Show what the replay log of a run holds."
-    parser = Parser(prog="mrcdrl replay inspect", description=description)
-    add_run(parser)
-    parser.add_argument(
-        "--shard", type=whole_number(0), default=0, help="the replay shard; default: 0"
-    )
-    parser.add_argument("--config", help="a preset or a TOML file; default: the run's")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--export", type=Path, metavar="FILE.npz", help="write the transitions")
-    add_config_flags(parser)
-    arguments = parser.parse_args(argv)
+    arguments = parser().parse_args(argv)
     run = find_run(arguments.run, arguments.run_dir)
     if arguments.export is not None:
         prepare_output(arguments.export)
@@ -50,6 +46,21 @@ def main(argv: Sequence[str]) -> int:
     if arguments.export is not None:
         print(f"\n{arguments.export}: {count} transitions")
     return 0
+
+
+def parser() -> Parser:
+    """The command's flags."""
+    description = "Show what the replay log of a run holds."
+    made = Parser(prog="mrcdrl replay inspect", description=description)
+    add_run(made)
+    made.add_argument(
+        "--shard", metavar="N", type=whole_number(0), default=0, help="the replay shard; default: 0"
+    )
+    add_config_flag(made, None, of_run=True)
+    made.add_argument("--json", action="store_true", help="print JSON")
+    made.add_argument("--export", type=Path, metavar="FILE.npz", help="write the transitions")
+    add_config_flags(made)
+    return made
 
 
 def _config(run: Path, source: str | None, given: dict[str, str]) -> Config | None:

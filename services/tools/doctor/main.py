@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mrcdrl.common.config import Config, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides
+from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
+from mrcdrl.common.config.arguments import Parser, add_config_flag, add_config_flags, overrides
 from mrcdrl.common.errors import EndpointError
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.runs import add_run, runs_folder
@@ -29,7 +29,7 @@ def main(argv: Sequence[str]) -> int:
     found: list[Finding] = []
     if arguments.run:
         found, config = look_at_run(arguments)
-    own = config or load_config(arguments.config, overrides(arguments))
+    own = config or load_config(arguments.config or DEFAULT_PRESET, overrides(arguments))
     found += of_this_machine(own, runs_folder(arguments.run_dir), running=config is not None)
     if arguments.json:
         lines = [dataclasses.asdict(finding) for finding in found]
@@ -44,7 +44,7 @@ def parser() -> Parser:
     made = Parser(prog="mrcdrl doctor", description="Check this machine and a run.")
     add_run(made, "also check this run, which is up")
     made.add_argument("--connect", action="append", help="its endpoint, such as tcp/HOST:7447")
-    made.add_argument("--config", help="a preset or a TOML file; default: the run's")
+    add_config_flag(made, of_run=True)
     made.add_argument("--json", action="store_true", help="print the findings as JSON")
     made.set_defaults(id="doctor", transport=None)
     add_config_flags(made)

@@ -4,7 +4,6 @@ Invariants: killed at any moment, the same command goes on where it was; what is
 again.
 """
 
-import argparse
 import fnmatch
 import logging
 import sys
@@ -31,7 +30,7 @@ _REPORT_S = 30.0
 
 def main(argv: Sequence[str]) -> int:
     """Run the cells; return the exit code: 0 if all that were asked for are done."""
-    arguments = _parse(argv)
+    arguments = parser().parse_args(argv)
     out = arguments.out or runs_folder() / "experiments" / arguments.grid.stem
     every = [CellFiles(cell, out) for cell in read_grid(arguments.grid)]
     asked = [f for f in every if fnmatch.fnmatchcase(f.cell.name, arguments.only)]
@@ -39,7 +38,9 @@ def main(argv: Sequence[str]) -> int:
         names = ", ".join(files.cell.name for files in every)
         raise ConfigError(f"no cell is named like {arguments.only!r}; the cells are {names}")
     if arguments.list:
-        sys.stdout.writelines(f"{files.state:<8} {files.cell.name}\n" for files in asked)
+        states = {files.cell.name: files.state for files in asked}
+        lines = "".join(f"{state:<8} {name}\n" for name, state in states.items())
+        sys.stdout.write(to_line(states) if arguments.json else lines)
         return 0
     stop = StopSignal().listen()
     command = " ".join(["mrcdrl experiment", *argv])
@@ -50,19 +51,28 @@ def main(argv: Sequence[str]) -> int:
         atomic_write(out / _RESULTS, "".join(map(to_line, results)).encode())
     except OSError as error:
         raise RunDirectoryError(f"{out} cannot be written: {reason(error)}") from error
-    sys.stdout.write(table(every))
-    print(f"{out / _RESULTS}: {len(results)} of {len(every)} results")
+    if arguments.json:
+        sys.stdout.writelines(map(to_line, results))
+    else:
+        sys.stdout.write(table(every))
+        print(f"{out / _RESULTS}: {len(results)} of {len(every)} results")
     return 0 if all(files.result() for files in asked) else 1
 
 
-def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser(prog="mrcdrl experiment", description="Train a grid: settings and seeds.")
-    parser.add_argument("grid", type=Path, help="a TOML file: see docs/experiments.md")
-    parser.add_argument("--out", type=Path, help="folder of results; runs/experiments/GRID")
-    parser.add_argument("--jobs", type=whole_number(1), default=1, help="cells at once; default: 1")
-    parser.add_argument("--only", metavar="PATTERN", default="*", help="cells named so, as 'x-*'")
-    parser.add_argument("--list", action="store_true", help="print each cell's state, do nothing")
-    return parser.parse_args(argv)
+def parser() -> Parser:
+    """The command's flags."""
+    made = Parser(prog="mrcdrl experiment", description="Train a grid: settings and seeds.")
+    made.add_argument("grid", type=Path, metavar="GRID", help="TOML file: see docs/experiments.md")
+    made.add_argument(
+        "--out", type=Path, metavar="DIR", help="of results; default: runs/experiments/GRID"
+    )
+    made.add_argument(
+        "--jobs", type=whole_number(1), metavar="N", default=1, help="cells at once; default: 1"
+    )
+    made.add_argument("--only", metavar="PATTERN", default="*", help="cells named so, as 'x-*'")
+    made.add_argument("--list", action="store_true", help="print each cell's state, do nothing")
+    made.add_argument("--json", action="store_true", help="print results as JSON, one a line")
+    return made
 
 
 def _reporter(cells: Sequence[CellFiles]) -> Callable[[int], None]:

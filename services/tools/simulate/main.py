@@ -14,7 +14,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 
 from mrcdrl.common.config import DEFAULT_PRESET, load_config
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
+from mrcdrl.common.config.arguments import (
+    Parser,
+    add_config_flag,
+    add_config_flags,
+    overrides,
+    whole_number,
+)
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.process import StopSignal
@@ -28,6 +34,11 @@ from mrcdrl.services.tools.simulate.target import NAME, joined, own
 ROBOT_STEPS_PER_S = 4300.0  # of an actor with a dedicated core: docs/profile.md
 _FILES = 4  # open files per actor, both here and in replay or the router: two connections' ends
 _SPARE_FILES = 200
+_SHOWN = (  # in the short help
+    "arena.num_robots",
+    "replay.shards",
+    "replay.samples_per_insert",
+)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -57,34 +68,49 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser(prog="mrcdrl simulate", description=__doc__.splitlines()[0].split(": ")[1])
-    parser.add_argument("--actors", type=whole_number(1), default=200)
-    parser.add_argument("--minutes", type=_positive, default=1.0)
-    parser.add_argument(
+def parser() -> Parser:
+    """The command's flags."""
+    made = Parser(
+        prog="mrcdrl simulate", description="Put the load of many actors on replay, without arenas."
+    )
+    made.add_argument(
+        "--actors", metavar="N", type=whole_number(1), default=200, help="to simulate; default: 200"
+    )
+    made.add_argument(
+        "--minutes", metavar="MINUTES", type=_positive, default=1.0, help="to measure; default: 1"
+    )
+    made.add_argument(
         "--rate",
+        metavar="X",
         type=lambda text: math.inf if text == "max" else _positive(text),
         default=ROBOT_STEPS_PER_S,
         help="robot steps per second of each actor, or max: as many as are acknowledged; "
         f"default: {ROBOT_STEPS_PER_S:g}, those of an actor with a dedicated core",
     )
-    parser.add_argument(
-        "--processes", type=whole_number(1), help="of the actors; default: one per core"
+    made.add_argument(
+        "--processes", metavar="N", type=whole_number(1), help="of the actors; default: one a core"
     )
-    parser.add_argument("--publications", type=_frequency, help="of weights a second; default: 1")
-    parser.add_argument("--router", action="store_true", help="put a router in front of replay")
-    parser.add_argument("--config", help=f"a preset or a TOML file; default: {DEFAULT_PRESET}")
-    add_run(parser, f"join this run, whose name begins with {NAME}")
-    parser.add_argument("--connect", help="the run's endpoint, such as tcp/127.0.0.1:7447")
-    parser.add_argument(
+    made.add_argument(
+        "--publications", metavar="X", type=_frequency, help="of weights a second; default: 1"
+    )
+    made.add_argument("--router", action="store_true", help="put a router in front of replay")
+    add_config_flag(made)
+    add_run(made, f"join this run, whose name begins with {NAME}")
+    made.add_argument("--connect", metavar="ENDPOINT", help="the run's, such as tcp/127.0.0.1:7447")
+    made.add_argument(
         "--force", action="store_true", help="join any run; its learner then trains on made-up data"
     )
-    add_config_flags(parser)
-    arguments = parser.parse_args(argv)
+    add_config_flags(made, _SHOWN)
+    return made
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    made = parser()
+    arguments = made.parse_args(argv)
     if arguments.connect and not arguments.run:
-        parser.error("--connect needs the run's name; without both replay is started here")
+        made.error("--connect needs the run's name; without both replay is started here")
     if arguments.run:
-        _check_joining(parser, arguments)
+        _check_joining(made, arguments)
     elif arguments.publications is None:
         arguments.publications = 1.0
     arguments.processes = min(arguments.processes or available_cores(), arguments.actors)

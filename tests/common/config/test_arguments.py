@@ -6,7 +6,13 @@ from pathlib import Path
 import pytest
 
 from mrcdrl.common.config import load_config, sections
-from mrcdrl.common.config.arguments import Parser, add_config_flags, overrides, whole_number
+from mrcdrl.common.config.arguments import (
+    SEEDS,
+    Parser,
+    add_config_flags,
+    overrides,
+    whole_number,
+)
 
 FIELDS = [(section, name) for section, model in sections().items() for name in model.model_fields]
 
@@ -39,11 +45,20 @@ def test_every_field_has_a_flag() -> None:
     assert given(*flags) == expected
 
 
-def test_the_help_describes_every_field_with_its_default() -> None:
-    text = " ".join(make_parser().format_help().split())
-    for section, name in FIELDS:
-        assert f"--{section}.{name} X" in text
-    assert "gamma X (paper) Default: 0.99" in text
+def test_a_seed_sets_those_of_training_that_have_no_flag_of_their_own() -> None:
+    assert given("--seed", "7") == dict.fromkeys(SEEDS, "7")
+    for flags in (("--seed", "7", "--learner.seed", "8"), ("--learner.seed", "8", "--seed", "7")):
+        assert given(*flags) == dict.fromkeys(SEEDS, "7") | {"learner.seed": "8"}
+
+
+def test_a_command_keeps_a_flag_of_its_own() -> None:
+    parser = Parser(prog="mrcdrl test")
+    for flag in ("--actors", "--seed"):
+        parser.add_argument(flag)
+    add_config_flags(parser)
+    parsed = parser.parse_args(["--actors", "3", "--seed", "4", "--run.actors", "5"])
+    assert (parsed.actors, parsed.seed) == ("3", "4")
+    assert overrides(parsed) == {"run.actors": "5"}
 
 
 def test_flags_may_stand_anywhere() -> None:
@@ -80,6 +95,8 @@ def test_flags_reach_the_configuration() -> None:
         ("--learner.batchsize=64", "--learner.batch_size"),
         ("--agent.n_steps", "--agent.n_step"),
         ("--run_dir", "--run-dir"),
+        ("--batch-size", "--learner.batch_size"),
+        ("--threads", "--actor.threads, --learner.threads or --evaluator.threads"),
     ],
 )
 def test_an_unknown_flag_gets_the_nearest_as_a_suggestion(
@@ -115,11 +132,11 @@ def test_a_number_out_of_range_is_one_line(
     text: str, reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parser = make_parser()
-    parser.add_argument("--seed", type=whole_number(0))
-    assert parser.parse_args(["--seed", "7"]).seed == 7
+    parser.add_argument("--count", type=whole_number(0))
+    assert parser.parse_args(["--count", "7"]).count == 7
     with pytest.raises(SystemExit):
-        parser.parse_args(["--seed", text])
-    assert f"argument --seed: {reason}" in capsys.readouterr().err
+        parser.parse_args(["--count", text])
+    assert f"argument --count: {reason}" in capsys.readouterr().err
 
 
 ROOT = Path(__file__).parents[3]

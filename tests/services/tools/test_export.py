@@ -12,8 +12,9 @@ from mrcdrl.common.errors import CheckpointError, ConfigError, MrcdrlError
 from mrcdrl.common.model.q_network import Kind, QNetwork
 from mrcdrl.common.model.weights_io import network_from_bytes, weights_to_bytes
 from mrcdrl.services.tools import export as exporting
+from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.export import FORMATS, METADATA, NAMES, main, real_states
-from mrcdrl.services.tools.subject import subject, subject_parser
+from mrcdrl.services.tools.subject import subject
 
 VIEW_PX = 32
 FLAGS = (f"--arena.view_px={VIEW_PX}", "--config", "smoke")
@@ -41,7 +42,7 @@ def put(path: Path, kind: Kind) -> Path:
 
 
 def states_of(weights: Path, count: int) -> torch.Tensor:
-    given = subject(subject_parser("export", "").parse_args([str(weights), *FLAGS]))
+    given = subject(flags.evaluate().parse_args([str(weights), *FLAGS]))
     assert given.policy is not None
     return torch.from_numpy(real_states(given.config, given.policy, count))
 

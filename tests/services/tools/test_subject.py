@@ -14,7 +14,8 @@ from mrcdrl.common.model.weights_files import write_weights
 from mrcdrl.common.model.weights_io import weights_to_bytes
 from mrcdrl.common.runtime.files import sha256
 from mrcdrl.services.evaluator.trial import ControllerPlayer, PolicyPlayer
-from mrcdrl.services.tools.subject import Subject, subject, subject_parser
+from mrcdrl.services.tools import flags
+from mrcdrl.services.tools.subject import Subject, subject
 
 VIEW_PX = 32
 VIEW = f"--arena.view_px={VIEW_PX}"
@@ -26,7 +27,7 @@ def payload() -> bytes:
 
 
 def named(*argv: object) -> Subject:
-    return subject(subject_parser("evaluate", "").parse_args([str(arg) for arg in argv]))
+    return subject(flags.evaluate().parse_args([str(arg) for arg in argv]))
 
 
 def test_a_controller_plays_in_the_preset_quick() -> None:
