@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -32,14 +32,16 @@ def display(
     clock: Callable[[], float],
     watching: Watching,
     lines: Show | None = None,
+    *,
+    stream: TextIO | None = None,
 ) -> Iterator[Show]:
     """Yield a function that shows the state now: on a live screen, or as a plain line.
 
     keys: what Ctrl-C does. watching: guards all that is written. lines: what to call instead of
-    both.
+    both. stream: written to; stdout by default.
     """
-    shown = ExitStack()
-    draw = lines or _plain(state, clock)
+    shown, written = ExitStack(), stream or sys.stdout
+    draw = lines or _plain(state, clock, written)
 
     def show() -> None:
         nonlocal draw
@@ -48,11 +50,11 @@ def display(
                 draw()
             except OSError:
                 draw = _nothing
-                _give_up(shown)
+                _give_up(shown, written)
                 raise
 
     with watching(_PART):
-        if lines is None and can_draw(console := OpenConsole()):
+        if lines is None and can_draw(console := OpenConsole(file=written)):
             draw = shown.enter_context(_screen(console, state, run_dir, keys, clock))
     try:
         yield show
@@ -74,10 +76,10 @@ def can_draw(console: Console) -> bool:
     return console.is_terminal and not console.is_dumb_terminal and unicode
 
 
-def _plain(state: RunState, clock: Callable[[], float]) -> Show:
+def _plain(state: RunState, clock: Callable[[], float], stream: TextIO) -> Show:
     def print_line() -> None:
-        sys.stdout.write(f"{plain_line(state, clock())}\n")
-        sys.stdout.flush()
+        stream.write(f"{plain_line(state, clock())}\n")
+        stream.flush()
 
     return at_most_every(_PLAIN_PERIOD_S, clock, print_line)
 
@@ -94,9 +96,9 @@ def _nothing() -> None:
     """Show nothing."""
 
 
-def _give_up(shown: ExitStack) -> None:
+def _give_up(shown: ExitStack, stream: TextIO) -> None:
     """Leave the screen and drop what waits to be written."""
-    discard(sys.stdout)
+    discard(stream)
     shown.close()
 
 

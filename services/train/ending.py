@@ -3,10 +3,13 @@
 Invariant: only files that exist are named.
 """
 
+import json
 import shlex
 from pathlib import Path
 
+from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.runtime.files import BEST_WEIGHTS
+from mrcdrl.common.runtime.files import reason as failure
 from mrcdrl.common.runtime.runs import runs_folder
 from mrcdrl.services.monitor.recorder import SUMMARY
 from mrcdrl.services.monitor.records import read_last_metrics
@@ -37,6 +40,14 @@ def ending(run_dir: Path, reason: str) -> str:
     files = [name for name in _FILES if (run_dir / name).is_file()]
     lines.append(("files", f"{run_dir}{': ' * bool(files)}{', '.join(files)}"))
     return "".join(f"{name:<9} {said}\n" for name, said in lines)
+
+
+def ending_as_json(run_dir: Path) -> str:
+    """The run's summary as one line; raises RunDirectoryError if none could be written."""
+    try:
+        return f"{json.dumps(json.loads((run_dir / SUMMARY).read_bytes()))}\n"
+    except OSError as error:
+        raise RunDirectoryError(f"{run_dir} has no {SUMMARY} to print: {failure(error)}") from error
 
 
 def _success(run_dir: Path) -> str:

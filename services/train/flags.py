@@ -14,7 +14,6 @@ _SHOWN = (  # in the short help
     "run.actors",
     "agent.kind",
     "arena.target_layout",
-    "replay.capacity",
     "learner.batch_size",
     "learner.device",
 )
@@ -35,6 +34,7 @@ def parser() -> Parser:
     made.add_argument(
         "--dry-run", action="store_true", help="say what the run would be and take, and end"
     )
+    made.add_argument("--json", action="store_true", help="print the summary as JSON at the end")
     add_run_dir(made)
     add_config_flags(made, _SHOWN)
     return made

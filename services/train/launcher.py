@@ -8,6 +8,7 @@ import contextlib
 import logging
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ class Plan:
     before: Config  # the settings of that
     open: Callable[[], RunDirectory]  # creates or resumes the run
     dry_run: bool
+    json: bool  # print the summary at the end
 
 
 def open_run(argv: Sequence[str]) -> RunDirectory:
@@ -66,12 +68,13 @@ def plan_run(argv: Sequence[str]) -> Plan:
     made = parser()
     arguments = made.parse_args(argv)
     given = overrides(arguments)
+    if arguments.json and arguments.dry_run:
+        made.error("--json prints what a run reached: not with --dry-run")
     if arguments.resume:
         if arguments.name or arguments.config:
             made.error("--resume keeps the run's name and configuration: no --name or --config")
-        return _resumption(
-            find_run(arguments.resume, arguments.run_dir), given, dry_run=arguments.dry_run
-        )
+        path = find_run(arguments.resume, arguments.run_dir)
+        return _resumption(path, given, dry_run=arguments.dry_run, json=arguments.json)
     preset = arguments.config or DEFAULT_PRESET
     config = load_config(preset, given)
     check_possible(config)
@@ -79,10 +82,18 @@ def plan_run(argv: Sequence[str]) -> Plan:
     path = new_run_path(name, arguments.run_dir)
     create = RunDirectory.create if arguments.name else RunDirectory.create_free
     before = load_config(preset, environ={})
-    return Plan(path, config, preset, before, partial(create, path, config), arguments.dry_run)
+    return Plan(
+        path,
+        config,
+        base=preset,
+        before=before,
+        open=partial(create, path, config),
+        dry_run=arguments.dry_run,
+        json=arguments.json,
+    )
 
 
-def _resumption(path: Path, given: dict[str, str], *, dry_run: bool) -> Plan:
+def _resumption(path: Path, given: dict[str, str], *, dry_run: bool, json: bool) -> Plan:
     def check(before: Config, now: Config) -> None:
         check_possible(now, resumed=True)
         check_unfinished(path, before, now, given)
@@ -91,7 +102,7 @@ def _resumption(path: Path, given: dict[str, str], *, dry_run: bool) -> Plan:
     resume = partial(RunDirectory.resume, path, given, check)
     if dry_run:
         check(before, config)
-    return Plan(path, config, path.name, before, resume, dry_run)
+    return Plan(path, config, path.name, before, resume, dry_run, json)
 
 
 def check_possible(config: Config, *, resumed: bool = False) -> None:
@@ -132,7 +143,9 @@ def supervise(
         if run.resumed:
             rule.go_on()
         start_workers(run, fleet, endpoint)
-        with display(state, run.path, _KEYS, lambda: follower.now, watching) as show:
+        # Progress goes to stderr: what is printed on stdout is the result.
+        shown = display(state, run.path, _KEYS, lambda: follower.now, watching, stream=sys.stderr)
+        with shown as show:
             reason = None
             while reason is None:
                 follower.listen(_TICK_S)

@@ -8,7 +8,7 @@ from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.stopping import failed
-from mrcdrl.services.train.ending import ending
+from mrcdrl.services.train.ending import ending, ending_as_json
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.forecast import forecast
 from mrcdrl.services.train.launcher import expectation, plan_run, supervise, write_plots
@@ -39,5 +39,5 @@ def main(argv: Sequence[str]) -> int:
             fleet.stop()
         _LOG.info("%s; writing plots and video (Ctrl-C skips them) …", reason)
         write_plots(run.path, hurry)
-    sys.stdout.write(ending(run.path, reason))
+    sys.stdout.write(ending_as_json(run.path) if plan.json else ending(run.path, reason))
     return 0

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from mrcdrl.common.config import load_config, to_toml
+from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import stopped
-from mrcdrl.services.train.ending import ending
+from mrcdrl.services.train.ending import ending, ending_as_json
 from mrcdrl.services.train.launcher import plan_run
 
 BEST = {
@@ -34,6 +35,15 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "four" / "checkpoints" / "best.safetensors").touch()
     (tmp_path / "four" / "checkpoints" / "best.json").write_text(json.dumps(BEST))
     return tmp_path / "four"
+
+
+def test_a_program_gets_the_summary_or_one_line(run: Path) -> None:
+    line = ending_as_json(run)
+    assert line.count("\n") == 1
+    assert json.loads(line) == json.loads((run / "summary.json").read_bytes())
+    (run / "summary.json").unlink()
+    with pytest.raises(RunDirectoryError, match=r"no summary\.json to print: No such file"):
+        ending_as_json(run)
 
 
 def test_the_result_comes_first_then_what_to_do_and_then_the_files(run: Path) -> None:
