@@ -201,12 +201,15 @@ def origin(
     Arguments besides the setting's name, and errors, are those of `load_config`.
     """
     section, name = key.split(".")
-    if key in (overrides or {}):
+    names = _SPELLINGS if section == "arena" and name in _SPELLINGS else {name}
+    keys = {f"{section}.{spelling}" for spelling in names}
+    if keys & (overrides or {}).keys():
         return "a flag"
-    if key in environment_overrides(os.environ if environ is None else environ):
-        return f"the environment, {variable(section, name)}"
+    environment = environment_overrides(os.environ if environ is None else environ)
+    for found in keys & environment.keys():
+        return f"the environment, {variable(*found.split('.'))}"
     for layer, table in reversed([] if source is None else _layers(source)):
-        if name in table.get(section, {}):
+        if names & table.get(section, {}).keys():
             return source_name(layer)
     return "its default"
 

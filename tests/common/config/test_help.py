@@ -6,7 +6,9 @@ import pytest
 
 from mrcdrl.common.config import load_config, preset_names, to_toml
 from mrcdrl.common.config.arguments import Parser, add_config_flag, add_config_flags
-from mrcdrl.common.config.settings import all_settings
+from mrcdrl.common.config.settings import all_settings, find_setting
+
+ROBOTS = find_setting("arena.num_robots").meaning.rstrip(".")
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +38,7 @@ def shown(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_the_short_help_has_what_people_use(capsys: pytest.CaptureFixture[str]) -> None:
     text = shown(capsys, "--help")
     assert text.startswith("usage: mrcdrl test [WEIGHTS] --out FILE [flags] Test.")
-    assert "--robots N Robots, all with the same network (between 1 and 10; default: 2)" in text
+    assert f"--robots N {ROBOTS} (between 1 and 10; default: 2)" in text
     assert "(adam or rmsprop; default: adam)" in text
     assert "--help-all" in text
     assert "--agent.gamma" not in text
@@ -66,7 +68,7 @@ def test_a_run_and_the_environment_set_defaults_too(
 
 def test_help_is_shown_whatever_else_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
     text = shown(capsys, "--config", "nosuch", "--treads", "3", "--help")
-    assert "--robots N Robots, all with the same network (between 1 and 10)" in text
+    assert f"--robots N {ROBOTS} (between 1 and 10)" in text
     assert "settings (defaults of preset quick)" in shown(capsys, "--config", "--help")
 
 
