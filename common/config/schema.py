@@ -655,6 +655,13 @@ class Config(Section):
             if holds:
                 raise ValueError(f"run.turn_size {turn_size} {reason}")
 
+    def each_number(self) -> tuple[Self, ...]:
+        """The configuration with each of arena.robots alone, in their order."""
+        arena = self.arena
+        return tuple(
+            self.model_copy(update={"arena": arena.with_robots(number)}) for number in arena.numbers
+        )
+
 
 def sections() -> dict[str, type[Section]]:
     """The class of each section by name, in the order of the file."""

@@ -3,8 +3,10 @@
 import dataclasses
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +29,7 @@ from mrcdrl.services.evaluator.trial import PolicyPlayer, play
 
 _LOG = logging.getLogger("evaluator")
 _POLL_S = 0.2
+_BY_ROBOTS = "success_by_robots"  # in the manifest of the best weights
 _WORTH_CONFIRMING = 0.9  # success; below it, learning outruns luck
 _CONFIRMING_SEED = 500_000  # added to evaluator.seed: no test that is quoted has these starts
 
@@ -50,12 +53,11 @@ class Evaluator:
         self._reporter = StatsReporter(
             session.publisher(keys.stats("evaluator", worker)), "evaluator", worker, warms_up=True
         )
-        self._evaluator = WeightsEvaluator(config, worker)
-        self._reader = WeightsReader(session, keys, self._evaluator.adopt)
-        confirmer = WeightsEvaluator(confirming(config), worker)
+        self._evaluate_all = AllNumbers(config, worker, self._before_frame)
+        self._reader = WeightsReader(session, keys, self._evaluate_all.adopt)
         self._best = BestWeights(
             joining.run_dir / BEST_WEIGHTS,
-            lambda weights: confirmer.evaluate(weights, self._before_frame),
+            AllNumbers(confirming(config), worker, self._before_frame),
         )
         self._publisher = session.publisher(keys.evaluation(worker))
         self._frames = 0  # each of many arenas
@@ -75,25 +77,31 @@ class Evaluator:
             weights = self._newest_after(began_s + rest_s)
 
     def _evaluate(self, weights: Weights) -> None:
-        """Evaluate one version, publish the result, keep the weights if they are the best."""
+        """Evaluate one version, publish the results, keep the weights if they are the best.
+
+        Each number of robots is evaluated apart.
+        """
         self._version, self._busy = weights.version, True
-        result = self._evaluator.evaluate(weights, self._before_frame)
-        if result is not None:
-            self._evaluations += 1
-            self._publisher.put(encode(result))
-            self._keep(weights, result)
-            if self._evaluations == 1:
+        first = self._evaluations == 0
+        results = self._evaluate_all(weights, self._publish)
+        if results:
+            self._keep(weights, results)
+            if first:
                 self._after_first()
         self._busy = False
 
-    def _keep(self, weights: Weights, result: Evaluation) -> None:
-        """Keep the weights if they are the best; a full disk does not end the evaluator."""
+    def _keep(self, weights: Weights, results: Sequence[Evaluation]) -> None:
+        """Keep the weights if they are the best; a full disk is no reason to stop evaluating."""
         try:
-            self._best.offer(weights, result)
+            self._best.offer(weights, results)
         except CheckpointError as error:
             self._failures += 1
             if self._failures.bit_count() == 1:  # the 1st, 2nd, 4th …
                 _LOG.warning("%s (%d times so far)", error, self._failures)
+
+    def _publish(self, result: Evaluation) -> None:
+        self._evaluations += 1
+        self._publisher.put(encode(result))
 
     def _newest_after(self, until_s: float) -> Weights | None:
         """Wait until this time and for newer weights; return them, or None once stopped."""
@@ -183,6 +191,36 @@ class WeightsEvaluator:
         )
 
 
+class AllNumbers:
+    """Evaluates weights with each number of robots that an episode may have."""
+
+    def __init__(self, config: Config, worker: str, keep_going: Callable[[], bool]) -> None:
+        """keep_going: called again and again; an evaluation ends as soon as it returns False."""
+        self._evaluators = [WeightsEvaluator(one, worker) for one in config.each_number()]
+        self._keep_going = keep_going
+
+    def adopt(self, weights: Weights) -> None:
+        """Take the weights to evaluate; raises CheckpointError for another network's."""
+        for evaluator in self._evaluators:
+            evaluator.adopt(weights)
+
+    def __call__(
+        self, weights: Weights, report: Callable[[Evaluation], None] = lambda _result: None
+    ) -> list[Evaluation]:
+        """Evaluate the weights with each number; none without starts, or if it was ended.
+
+        report: called with each result as it is there.
+        """
+        results = []
+        for evaluator in self._evaluators:
+            result = evaluator.evaluate(weights, self._keep_going)
+            if result is None:
+                return []
+            report(result)
+            results.append(result)
+        return results
+
+
 class BestWeights:
     """The file of the weights that scored best so far, beside the checkpoints.
 
@@ -193,30 +231,49 @@ class BestWeights:
     def __init__(
         self,
         path: Path,
-        confirm: Callable[[Weights], Evaluation | None] = lambda _weights: None,
+        confirm: Callable[[Weights], Sequence[Evaluation]] = lambda _weights: (),
     ) -> None:
-        """confirm: evaluates weights again; None where it does not, or was stopped."""
+        """confirm: evaluates weights again; nothing where it does not, or was stopped."""
         self._path = path
         self._confirm = confirm
 
-    def offer(self, weights: Weights, result: Evaluation) -> None:
-        """Keep the weights if they scored better: more successes, or as many in fewer frames."""
-        if _rank(result) <= self._rank():
-            return
-        if result.success_rate >= _WORTH_CONFIRMING:
-            result = self._confirm(weights) or result
-        if _rank(result) > self._rank():
-            write_weights(self._path, weights.payload, dataclasses.asdict(result))
+    def offer(self, weights: Weights, results: Sequence[Evaluation]) -> None:
+        """Keep the weights if they scored better: more successes, or as many in fewer frames.
 
-    def _rank(self) -> tuple[float, float]:
+        results: one for each number of robots. The number that succeeds least counts most, and
+        then the mean over all of them.
+        """
+        if _rank(results) <= self._rank():
+            return
+        if _rank(results)[0] >= _WORTH_CONFIRMING:
+            results = self._confirm(weights) or results
+        if _rank(results) > self._rank():
+            write_weights(self._path, weights.payload, _manifest(results))
+
+    def _rank(self) -> tuple[float, float, float]:
         """Rank the kept weights, read again because another evaluator may have replaced them."""
         try:
             _, manifest = read_weights(self._path)
         except CheckpointError:
             manifest = {}
         rate, frames = manifest.get("success_rate", -1), manifest.get("mean_frames", np.inf)
-        return (float(rate), -float(frames))
+        by_robots = manifest.get(_BY_ROBOTS) or {"": rate}
+        return (float(rate), fmean(map(float, by_robots.values())), -float(frames))
 
 
-def _rank(result: Evaluation) -> tuple[float, float]:
-    return (result.success_rate, -result.mean_frames)
+def _weakest(results: Sequence[Evaluation]) -> Evaluation:
+    return min(results, key=lambda result: result.success_rate)
+
+
+def _rank(results: Sequence[Evaluation]) -> tuple[float, float, float]:
+    weakest = _weakest(results)
+    mean = fmean(result.success_rate for result in results)
+    return (weakest.success_rate, mean, -weakest.mean_frames)
+
+
+def _manifest(results: Sequence[Evaluation]) -> dict[str, Any]:
+    """What is said of the weights: the weakest result, and the success with each number."""
+    manifest = dataclasses.asdict(_weakest(results))
+    if len(results) > 1:
+        manifest[_BY_ROBOTS] = {str(r.num_robots): r.success_rate for r in results}
+    return manifest

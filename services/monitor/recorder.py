@@ -97,9 +97,11 @@ class Recorder(Closing):
         with self._watching(_RECORDING):
             self._evaluations.write(record_line(record))
             self._evaluations.flush()
+        evaluation = record.evaluation
+        mixed = self._config.arena.mixes_numbers
+        tag = f"evaluation/{evaluation.num_robots}_robots" if mixed else "evaluation"
         for name in EVALUATION_FIELDS:
-            value = getattr(record.evaluation, name)
-            self._event(f"evaluation/{name}", value, record.evaluation.learner_step)
+            self._event(f"{tag}/{name}", getattr(evaluation, name), evaluation.learner_step)
 
     def record_metrics(self, state: RunState, now: float) -> None:
         """Write the metrics of this second and flush all files; call it once a second."""
@@ -163,7 +165,7 @@ def restore(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
         rule.observe_episode(episode.episode)
         time_s = max(time_s, episode.time_s)
     for evaluation in read_evaluations(run_dir):
-        state.evaluations.append(evaluation)
+        state.restore_evaluation(evaluation)
         rule.observe_evaluation(evaluation.evaluation)
         time_s = max(time_s, evaluation.time_s)
     state.restore_counted(metrics, _counted(metrics))

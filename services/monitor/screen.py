@@ -103,7 +103,8 @@ def heading(title: str, more: str = "", style: str = "grey62") -> Rule:
 def header(state: RunState, now: float, name: str, width: int) -> Text:
     """One bar with the run's name, arena and agent, its time and the time left."""
     config = state.config
-    robots = f"{config.arena.num_robots} robot{'s' * (config.arena.num_robots != 1)}"
+    numbers = ", ".join(map(str, config.arena.numbers))
+    robots = f"{numbers} robot{'s' * (config.arena.num_robots != 1)}"
     left = f" mrcdrl  {printable(name)}  {robots} · {config.agent.kind}"
     left += f" · {config.arena.target_layout} targets"
     remaining = state.time_left_s(now)
@@ -199,11 +200,13 @@ def curves(state: RunState, now: float, width: int, height: int) -> Table:
         (SUCCESS_WINDOW + HISTORY_PERIOD * i, float(successes))
         for i, successes in enumerate(state.success_history)
     ]
-    tests = [(r.time_s / 60, 100 * r.evaluation.success_rate) for r in state.evaluations]
+    tests = [(r.time_s / 60, 100 * r.evaluation.success_rate) for r in state.weakest]
     rates = [rate for _, rate in tests]
     now_and_best = state.successes_per_100 is not None
     trained = f"{state.successes_per_100}, best {state.max_successes}" if now_and_best else "–"
     tested = f"{rates[-1]:.1f} %, best {max(rates):.1f} %" if tests else "–"
+    if state.config.arena.mixes_numbers:
+        tested = f"of the weakest number: {tested}"
     table.add_row(
         heading("successes per 100", trained, "cyan"),
         heading("test success", tested, "green"),
@@ -298,8 +301,11 @@ def evaluations(state: RunState, num_rows: int) -> Text:
     for record in reversed(state.evaluations[-num_rows:]):
         e = record.evaluation
         low, high = e.success_interval
-        text.append("\n" if text else "").append("★" if record is best else " ", style="yellow")
+        starred = best is not None and e is best.evaluation
+        text.append("\n" if text else "").append("★" if starred else " ", style="yellow")
         text.append(f" {clock(record.time_s):>7}  v{e.weights_version:<6}")
+        if state.config.arena.mixes_numbers:
+            text.append(f"{e.num_robots:>2} robots ")
         text.append(f"{e.success_rate:6.1%} success", style="bold green")
         text.append(f" ({100 * low:.0f}–{100 * high:.0f})".ljust(9), style="grey62")
         text.append(f"{e.collision_rate:6.1%} collision{e.timeout_rate:6.1%} time-out")
@@ -320,11 +326,19 @@ def log(state: RunState, num_rows: int) -> Text:
     return Text("\n".join(lines), style="yellow", no_wrap=True, overflow="ellipsis")
 
 
+def tests_line(state: RunState) -> str:
+    """The latest success in the test: "93.0%", or of each number of robots "1: 99.0% 4: 93.0%"."""
+    rates = {n: record.evaluation.success_rate for n, record in state.last_by_robots.items()}
+    if state.config.arena.mixes_numbers:
+        return " ".join(f"{number}: {rates[number]:.1%}" for number in sorted(rates)) or "–"
+    last = state.last_evaluation
+    return f"{last.evaluation.success_rate:.1%}" if last else "–"
+
+
 def plain_line(state: RunState, now: float) -> str:
     """The state as one line for a log, without colours."""
     successes, of = state.recent_successes
-    last = state.last_evaluation
-    test = f"{last.evaluation.success_rate:.1%}" if last else "–"
+    test = tests_line(state)
     doing = progress(state)
     fields = [
         told(state, now),

@@ -8,7 +8,7 @@ one record an evaluation.
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from mrcdrl.common.config import Config
@@ -25,6 +25,7 @@ from mrcdrl.common.messages.trajectory import (
 from mrcdrl.common.runtime.names import printable
 from mrcdrl.services.monitor.rates import Rate, Share, Spread, SpreadWindow
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW, EvaluationRecord
+from mrcdrl.services.monitor.weakest import Weakest
 
 ROLES = ("actor", "replay", "learner", "evaluator", "status")
 WITHOUT_METRICS = ("status",)  # roles that announce themselves and publish nothing
@@ -96,7 +97,10 @@ class RunState:
         self.since = ""  # such as "since status started", where `now` does not count from its start
         self.ending = ""  # why the run ends, once it does
         self.log: deque[str] = deque(maxlen=LOG_LINES)
-        self.evaluations: list[EvaluationRecord] = []
+        self.evaluations: list[EvaluationRecord] = []  # with each number of robots
+        self.weakest: list[EvaluationRecord] = []  # of each version, those with the least success
+        self.last_by_robots: dict[int, EvaluationRecord] = {}  # the latest of each number
+        self._weakest = Weakest(config.arena.numbers)
         self.episodes = 0
         self.max_successes = 0  # of 100 consecutive episodes
         self.success_history: list[int] = []  # successes_per_100, every HISTORY_PERIOD episodes
@@ -179,8 +183,16 @@ class RunState:
     def observe_evaluation(self, evaluation: Evaluation, now: float) -> EvaluationRecord:
         """Take an evaluation; return it with the progress of collection."""
         record = EvaluationRecord(now, self.env_steps, self.robot_steps, evaluation)
-        self.evaluations.append(record)
+        self.restore_evaluation(record)
         return record
+
+    def restore_evaluation(self, record: EvaluationRecord) -> None:
+        """Take an evaluation of earlier records."""
+        self.evaluations.append(record)
+        self.last_by_robots[record.evaluation.num_robots] = record
+        weakest = self._weakest.add(record.evaluation)
+        if weakest is not None:
+            self.weakest.append(replace(record, evaluation=weakest))
 
     def observe_presence(self, role: str, service_id: str, alive: bool) -> None:
         """Note that a service's liveliness token appeared or vanished."""
@@ -363,12 +375,20 @@ class RunState:
 
     @property
     def last_evaluation(self) -> EvaluationRecord | None:
-        return self.evaluations[-1] if self.evaluations else None
+        """The latest evaluation, with the number of robots that succeeds least."""
+        return self.weakest[-1] if self.weakest else None
 
     @property
     def best_evaluation(self) -> EvaluationRecord | None:
-        """The evaluation with the highest success rate, the first of equal ones."""
-        return max(self.evaluations, key=lambda r: r.evaluation.success_rate, default=None)
+        """The evaluation with the highest success rate, the first of equal ones.
+
+        Of each version, that with the number of robots that succeeds least.
+        """
+        return max(self.weakest, key=lambda r: r.evaluation.success_rate, default=None)
+
+    def evaluations_with(self, number: int) -> list[EvaluationRecord]:
+        """The evaluations with this number of robots."""
+        return [r for r in self.evaluations if r.evaluation.num_robots == number]
 
     def time_left_s(self, now: float) -> float | None:
         """Time until run.minutes or, at the present rate, run.learner_steps; None if unlimited."""

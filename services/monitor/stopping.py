@@ -5,10 +5,12 @@ same run always ends for the same reason; an evaluation counts once its weights 
 """
 
 from collections import deque
+from collections.abc import Sequence
 
 from mrcdrl.common.config import RunConfig
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW
+from mrcdrl.services.monitor.weakest import Weakest
 
 _STOPPED = "stopped ("
 _FAILED = "failed ("
@@ -53,11 +55,14 @@ class StoppingRule:
     The paper's rule (section 5.2): "the training can be stopped when a certain size is satisfied
     and when no larger value appears in the next 1000 episodes". The value is the number of
     successes in the last 100 episodes, taken after each episode from the 100th on; the certain
-    size is `patience_floor`.
+    size is `patience_floor`. Where there are several numbers of robots, each of them has to reach
+    the target.
     """
 
-    def __init__(self, run: RunConfig) -> None:
+    def __init__(self, run: RunConfig, numbers: Sequence[int] = (1,)) -> None:
+        """numbers: of robots, each of which is evaluated apart."""
         self._run = run
+        self._weakest = Weakest(numbers)
         self._latest: deque[bool] = deque(maxlen=SUCCESS_WINDOW)
         self._episodes = 0
         self._maximum = -1
@@ -80,10 +85,10 @@ class StoppingRule:
 
     def observe_evaluation(self, evaluation: Evaluation) -> None:
         target, epoch = self._run.target_success_rate, evaluation.weights_epoch
-        known = self._reached.get(epoch)
+        weakest, known = self._weakest.add(evaluation), self._reached.get(epoch)
         earliest = known is None or evaluation.weights_version < known.weights_version
-        if target and evaluation.success_rate >= target and earliest:
-            self._reached[epoch] = evaluation
+        if weakest is not None and target and weakest.success_rate >= target and earliest:
+            self._reached[epoch] = weakest
             if len(self._reached) > _EPOCHS:
                 del self._reached[next(iter(self._reached))]
 

@@ -31,6 +31,7 @@ def summary(state: RunState, config: Config, now: float, stop_reason: str) -> di
         "stop_reason": stop_reason,
         "wall_s": round(now, 3),
         "num_robots": config.arena.num_robots,
+        "robots": list(config.arena.numbers),
         "agent": config.agent.kind,
         "initial_weights": config.learner.initial_weights or None,
         "episodes": state.episodes,
@@ -49,6 +50,7 @@ def summary(state: RunState, config: Config, now: float, stop_reason: str) -> di
             "count": len(state.evaluations),
             "last": _evaluation(state.last_evaluation),
             "best": _evaluation(state.best_evaluation),
+            **_by_robots(state, config),
         },
         "reached": {f"{rate:g}": _reached(state, rate) for rate in REACHED},
         "versions": all_versions(),
@@ -68,13 +70,24 @@ def training_table(state: RunState) -> dict[str, float | int | None]:
     }
 
 
+def _by_robots(state: RunState, config: Config) -> dict[str, Any]:
+    """The last evaluation with each number of robots, where there are several numbers."""
+    numbers, last = config.arena.numbers, state.last_by_robots
+    if len(numbers) == 1:
+        return {}
+    return {"last_by_robots": {str(number): _evaluation(last.get(number)) for number in numbers}}
+
+
 def _evaluation(record: EvaluationRecord | None) -> dict[str, Any] | None:
     return None if record is None else flat(record)
 
 
 def _reached(state: RunState, rate: float) -> dict[str, float | int] | None:
-    """Cost of the first evaluation with that success rate; the step is that of its weights."""
-    for record in state.evaluations:
+    """Cost of the first evaluation with that success rate; the step is that of its weights.
+
+    Every number of robots has to reach it.
+    """
+    for record in state.weakest:
         if record.evaluation.success_rate >= rate:
             return {
                 "seconds": record.time_s,

@@ -147,26 +147,44 @@ def _draw_evaluations(axes: Axes, tests: Sequence[EvaluationRecord]) -> None:
     axes.set_ylim(-2, 112)
     tests = sorted(tests, key=lambda record: record.evaluation.learner_step)
     steps = np.array([record.evaluation.learner_step for record in tests], float)
-    if not tests:
-        say(axes, "no evaluations")
-    else:
-        rates = 100 * np.array([record.evaluation.success_rate for record in tests])
-        bounds = 100 * np.array([record.evaluation.success_interval for record in tests])
-        low, high = bounds.T
-        axes.fill_between(steps, low, high, color=GREEN, alpha=0.18, lw=0, label="95 % interval")
-        axes.vlines(steps, low, high, color=GREEN, alpha=0.4, lw=0.8)
-        starts = tests[-1].evaluation.episodes
-        label = f"{starts} starts each"
-        axes.plot(steps, rates, color=GREEN, lw=1.8, marker="o", ms=4, label=label)
-        best = int(np.argmax(rates))
-        axes.annotate(
-            f"{rates[best]:.1f} %", (steps[best], rates[best]), (0, 7),
-            textcoords="offset points", ha="center" if best else "left", fontweight="bold",
-        )  # fmt: skip
+    each = by_robots(tests)
+    if len(each) == 1:
+        _draw_tests(axes, tests, GREEN, "")
+    for number, (robots, own) in enumerate(each.items() if len(each) > 1 else ()):
+        dark = ROBOT_HUES[number % len(ROBOT_HUES)][1]
+        _draw_tests(axes, own, dark, f"{robots} robot{'s' * (robots != 1)}, ")
+    if tests:
         axes.legend(loc="lower right", frameon=False)
+    else:
+        say(axes, "no evaluations")
     last = max(10.0, steps.max(initial=0))
     axes.set_xlim(-0.02 * last, 1.04 * last)
     _minutes(axes, steps, [record.time_s for record in tests])
+
+
+def by_robots(tests: Sequence[EvaluationRecord]) -> dict[int, list[EvaluationRecord]]:
+    """The evaluations with each number of robots, in rising order."""
+    numbers = sorted({record.evaluation.num_robots for record in tests})
+    return {n: [r for r in tests if r.evaluation.num_robots == n] for n in numbers}
+
+
+def _draw_tests(axes: Axes, tests: Sequence[EvaluationRecord], colour: str, who: str) -> None:
+    """Plot the success over learner steps, with its interval, and mark the best."""
+    steps = np.array([record.evaluation.learner_step for record in tests], float)
+    rates = 100 * np.array([record.evaluation.success_rate for record in tests])
+    bounds = 100 * np.array([record.evaluation.success_interval for record in tests])
+    low, high = bounds.T
+    interval = "" if who else "95 % interval"
+    axes.fill_between(steps, low, high, color=colour, alpha=0.18, lw=0, label=interval)
+    axes.vlines(steps, low, high, color=colour, alpha=0.4, lw=0.8)
+    label = f"{who}{tests[-1].evaluation.episodes} starts each"
+    axes.plot(steps, rates, color=colour, lw=1.8, marker="o", ms=4, label=label)
+    best = int(np.argmax(rates))
+    axes.annotate(
+        f"{rates[best]:.1f} %", (steps[best], rates[best]), (0, 7),
+        textcoords="offset points", ha="center" if best else "left", fontweight="bold",
+        color=colour if who else None,
+    )  # fmt: skip
 
 
 def means(values: Float64Array, group: int) -> tuple[Float64Array, Float64Array]:

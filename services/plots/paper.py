@@ -5,6 +5,7 @@ Invariants: plotted with matplotlib's Figure on Agg, without global state.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from textwrap import fill
 
@@ -19,6 +20,7 @@ from mrcdrl.services.monitor.records import SUCCESS_WINDOW, read_episodes, read_
 from mrcdrl.services.plots.figures import (
     Path2D,
     blank,
+    by_robots,
     draw_paths,
     dress,
     explain_arena,
@@ -31,6 +33,7 @@ from mrcdrl.services.plots.figures import (
 SUFFIXES = (".png", ".svg")
 _ROW_NAME = 32  # characters in a line, beside a panel of 3 inches
 _STYLES = ("-", "--", ":", "-.")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")  # for numbers of robots of one run
 _COLOURS = ("#123c73", "#c4500a", "#2a7f3f", "#6a3d9a", "#b01050", "#0a7a80", "#8a7400", "#444444")
 
 
@@ -117,11 +120,15 @@ def curves(run_dirs: Sequence[Path], out: Path) -> None:
         line = {"color": colour, "ls": style, "label": run_dir.name}
         won = [record.episode.outcome is Outcome.SUCCESS for record in read_episodes(run_dir)]
         training.plot(*means(SUCCESS_WINDOW * np.array(won, float), SUCCESS_WINDOW), **line)
-        tests = sorted((e.evaluation for e in read_evaluations(run_dir)), key=_learner_step)
-        steps = [e.learner_step for e in tests]
-        test.plot(steps, [100 * e.success_rate for e in tests], **line)
-        bounds = 100 * np.array([e.success_interval for e in tests], float).reshape(-1, 2)
-        test.fill_between(steps, *bounds.T, color=colour, alpha=0.15, lw=0)
+        each = by_robots(read_evaluations(run_dir)) or {0: []}  # named all the same
+        for (robots, records), marker in zip(each.items(), cycle(_MARKERS)):
+            tests = sorted((e.evaluation for e in records), key=_learner_step)
+            steps = [e.learner_step for e in tests]
+            if len(each) > 1:
+                line |= {"label": f"{run_dir.name}, {robots} robots", "marker": marker}
+            test.plot(steps, [100 * e.success_rate for e in tests], **line)
+            bounds = 100 * np.array([e.success_interval for e in tests], float).reshape(-1, 2)
+            test.fill_between(steps, *bounds.T, color=colour, alpha=0.15, lw=0)
     for axes in (training, test):
         axes.set_ylim(-2, 102)
         axes.set_xlim(0, max(SUCCESS_WINDOW, axes.get_xlim()[1]))

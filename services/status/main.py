@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
     stop = StopSignal().listen()
     with ExitStack() as owned:
         joining, session, config = join(arguments, stop, owned)
-        state, rule = RunState(config), StoppingRule(config.run)
+        state, rule = RunState(config), StoppingRule(config.run, config.arena.numbers)
         recorder, lasted_s = None, 0.0
         if arguments.record:
             run = owned.enter_context(RunDirectory.join(joining.run_dir, config))
@@ -222,6 +222,10 @@ def status(state: RunState, now: float) -> dict[str, Any]:
         "replay_size": state.replay_size,
         "replay_capacity": state.replay_capacity,
         "success_rate": last.evaluation.success_rate if last else None,
+        "success_by_robots": {
+            str(number): record.evaluation.success_rate
+            for number, record in sorted(state.last_by_robots.items())
+        },
         "evaluated_version": last.evaluation.weights_version if last else None,
         **{name: None if value is None else round(value, 6) for name, value in figures},
     }

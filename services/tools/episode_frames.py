@@ -30,8 +30,8 @@ class Moment(NamedTuple):
 
 def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[Moment]:
     """Yield all frames of these episodes in order."""
-    codec = make_codec(config)
     for number, episode in enumerate(episodes, 1):
+        codec = make_codec(config.with_robots(episode.robots.shape[1]))
         last = len(episode.robots) - 1
         for frame, robots in enumerate(episode.robots):
             scene = Scene(robots, episode.targets, episode.obstacles)
@@ -51,12 +51,16 @@ def film_frames(
 ) -> Iterator[UInt8Array]:
     """Yield images uint8 BGR [H, W, 3] of all frames of these episodes, for a film.
 
-    note: which episodes these are.
+    note: which episodes these are. Those with fewer robots than others have black images in place
+    of absent ones'.
     """
+    most = max((episode.robots.shape[1] for episode in episodes), default=0)
     for number, frame, scene, views, ending in moments(config, episodes):
         caption = f"episode {number} of {len(episodes)}   frame {frame}"
         if ending:
             caption += f"   {ending}"
-        image = compose_frame(render_arena(scene, config, _ARENA_PX), views, caption, note)
+        absent = np.zeros((most - len(views), *views.shape[1:]), np.uint8)
+        shown = np.concatenate([views, absent])
+        image = compose_frame(render_arena(scene, config, _ARENA_PX), shown, caption, note)
         for _ in range(_ENDING_FRAMES if ending else 1):
             yield image

@@ -1,8 +1,10 @@
 """`mrcdrl evaluate`: the paper's test (section 5.3, Table 2) for weights or a controller.
 
-With --failures, failed episodes are replayed after the test, whose own numbers stay the same.
+With --failures, failed episodes are replayed after the test, whose own numbers stay the same. Where
+episodes differ in their number of robots, each number is tested apart, from as many starts.
 """
 
+import argparse
 import dataclasses
 import itertools
 import json
@@ -26,7 +28,14 @@ from mrcdrl.services.tools.subject import Subject, always, subject
 def main(argv: Sequence[str]) -> int:
     """Evaluate and print; return the exit code."""
     arguments = flags.evaluate().parse_args(argv)
-    evaluated = subject(arguments)
+    for evaluated in subject(arguments).each_number():
+        sys.stdout.write(told(evaluated, arguments))
+        sys.stdout.flush()
+    return 0
+
+
+def told(evaluated: Subject, arguments: argparse.Namespace) -> str:
+    """Evaluate the subject; the result as text, or as a line of JSON."""
     with Progress() as progress:
         result, measures, episodes = evaluate(
             evaluated,
@@ -42,14 +51,13 @@ def main(argv: Sequence[str]) -> int:
             failures = failures_of(
                 evaluated, episodes, arguments.seed, lambda: done(next(replayed))
             )
-    told = dataclasses.asdict(result) | {"navigation": dataclasses.asdict(measures)}
+    values = dataclasses.asdict(result) | {"navigation": dataclasses.asdict(measures)}
     text = table(result, evaluated) + navigation_table(measures)
     if arguments.failures is not None:
         summary = summarize(failures, arguments.episodes)
-        told["failures"] = as_json(failures, summary, arguments.failures)
+        values["failures"] = as_json(failures, summary, arguments.failures)
         text += failure_table(failures, summary, arguments.failures)
-    sys.stdout.write(json.dumps(told) + "\n" if arguments.json else text)
-    return 0
+    return json.dumps(values) + "\n" if arguments.json else text
 
 
 def evaluate(

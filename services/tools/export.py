@@ -84,7 +84,8 @@ def export(given: Subject, out: Path, progress: Progress) -> float:
 
 def real_states(config: Config, policy: Policy, count: int) -> np.ndarray:
     """States uint8 [count, S, V, V] of episodes played by the policy with epsilon 0.3."""
-    arena, codec, rng = config.arena, make_codec(config.arena), np.random.default_rng(0)
+    arena = config.arena.with_robots(config.arena.num_robots)
+    codec, rng = make_codec(arena), np.random.default_rng(0)
     arenas = ArenaBatch(arena, [rng])
     frames = FrameStack(arena.num_robots, arena.stack, arena.view_px)
     seen: list[np.ndarray] = []

@@ -31,7 +31,7 @@ _ARENA_PX = 900
 _INTENSITY_WEIGHTS = (0.114, 0.587, 0.299)  # OpenCV's, for blue, green and red
 # Fields that must agree for a comparison; rewards and images may differ between policies.
 _WORLD = (
-    "num_robots", "size_px", "wall_offset_px", "wall_thickness_px", "robot_radius_px",
+    "num_robots", "robots", "size_px", "wall_offset_px", "wall_thickness_px", "robot_radius_px",
     "target_size_px", "turn_deg", "step_px", "target_layout", "targets_px",
     "success_radius_px", "back_off_frames", "max_frames",
 )  # fmt: skip
@@ -50,8 +50,8 @@ def main(argv: Sequence[str]) -> int:
 
 def _arena(arguments: argparse.Namespace, _progress: Progress) -> None:
     """Draw a test start in the arena of each subject, or of --config if there is none."""
-    named = [shown.config for shown in _subjects(arguments)]
-    configs = [config.arena for config in named or [config_without_weights(arguments)]]
+    named = [shown.config for shown in _subjects(arguments)] or [config_without_weights(arguments)]
+    configs = [one.arena for config in named for one in config.each_number()]
     images, obstacles = [], False
     for config in configs:
         (start,) = test_starts(config, 1, arguments.seed)
@@ -65,8 +65,8 @@ def _arena(arguments: argparse.Namespace, _progress: Progress) -> None:
 def _views(arguments: argparse.Namespace, progress: Progress) -> None:
     """Show what the lowermost robot sees (Fig. 3)."""
     shown = _one(arguments)
-    config = shown.config.arena
     (episode,) = shown.episodes(1, arguments.seed, progress.stage("the episode"))
+    config = shown.config.arena.with_robots(episode.robots.shape[1])
     frame = min(arguments.frame, episode.frames)
     before = range(frame - config.stack + 1, frame + 1)
     targets, obstacles = episode.targets, episode.obstacles

@@ -44,7 +44,9 @@ def evaluate() -> Parser:
         metavar="N",
         help="describe the first N failures (without N: all), and what share failed in which way",
     )
-    made.add_argument("--json", action="store_true", help="print JSON")
+    made.add_argument(
+        "--json", action="store_true", help="print JSON, a line for each number of robots"
+    )
     add_config_flags(made, _SHOWN)
     return made
 

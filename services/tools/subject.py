@@ -3,8 +3,9 @@
 import argparse
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -51,17 +52,25 @@ class Subject:
         name = self.controller or ""
         return ControllerPlayer(lambda: make_controller(name, arena, rng), epsilon, rng)
 
+    def each_number(self) -> list[Self]:
+        """The subject with each number of robots alone, in rising order."""
+        return [replace(self, config=config) for config in self.config.each_number()]
+
     def episodes(self, num: int, seed: int, report: Done) -> list[EpisodeResult]:
         """Play the paper's test from `num` starts, keeping the robots' paths.
 
-        report: called with the number of episodes finished.
+        Where there are several numbers of robots, they take turns, the greatest first. report:
+        called with the number of episodes finished.
         """
-        starts = test_starts(self.config.arena, num, seed)
-        player = self.player(seed)
-        return (
-            play(self.config.arena, starts, player, keep_paths=True, keep_going=always(report))
-            or []
-        )
+        parts = self.each_number()[::-1]
+        played: dict[int, EpisodeResult] = {}
+        for place, part in enumerate(parts):
+            arena, turns = part.config.arena, range(place, num, len(parts))
+            starts, player = test_starts(arena, len(turns), seed), part.player(seed)
+            going = always(lambda done, before=len(played): report(before + done))
+            results = play(arena, starts, player, keep_paths=True, keep_going=going) or []
+            played |= zip(turns, results, strict=True)
+        return [played[turn] for turn in range(num)]
 
 
 def config_without_weights(arguments: argparse.Namespace) -> Config:

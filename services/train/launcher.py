@@ -112,7 +112,8 @@ def check_possible(config: Config, *, resumed: bool = False) -> None:
     or a package or the initial weights are missing; EndpointError if a port is in use.
     """
     require("torch", "safetensors")
-    test_starts(config.arena, 1, config.evaluator.seed)
+    for one in config.each_number():
+        test_starts(one.arena, 1, config.evaluator.seed)
     initial_weights = "" if resumed else config.learner.initial_weights
     if initial_weights and not Path(initial_weights).exists():
         raise ConfigError(f"learner.initial_weights {initial_weights}: no such file or directory")
@@ -133,7 +134,8 @@ def supervise(
     hurry: listens from then on.
     """
     config = run.config
-    state, rule, watching = RunState(config), StoppingRule(config.run), Watching()
+    state, rule = RunState(config), StoppingRule(config.run, config.arena.numbers)
+    watching = Watching()
     endpoints = config.transport.listen or (free_endpoint(),)
     endpoint = endpoints[0]
     start_replay(run, fleet, endpoints)

@@ -24,7 +24,7 @@ def check_unfinished(path: Path, before: Config, now: Config, given: Mapping[str
     before, now: what the run was made with, and is resumed with. given: flags. A new limit, or the
     same given again, lets the run go on; but nothing lets it go beyond its learner steps.
     """
-    state, rule = RunState(now), StoppingRule(now.run)
+    state, rule = RunState(now), StoppingRule(now.run, now.arena.numbers)
     restore(path, state, rule)
     if new_limit(before, now, given):
         rule.go_on()

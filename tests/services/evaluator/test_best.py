@@ -12,7 +12,12 @@ from mrcdrl.common.model.policy import Policy, make_policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import SENT_AS, network_from_bytes, weights_to_bytes
-from mrcdrl.services.evaluator.evaluator import BestWeights, WeightsEvaluator, confirming
+from mrcdrl.services.evaluator.evaluator import (
+    AllNumbers,
+    BestWeights,
+    WeightsEvaluator,
+    confirming,
+)
 
 
 @pytest.fixture
@@ -20,13 +25,13 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "checkpoints" / "best.safetensors"
 
 
-def result(version: int, rate: float, frames: float) -> Evaluation:
+def result(version: int, rate: float, frames: float, num_robots: int = 2) -> Evaluation:
     return Evaluation(
         worker="evaluator-0",
         weights_epoch=0,
         weights_version=version,
         learner_step=10 * version,
-        num_robots=2,
+        num_robots=num_robots,
         episodes=100,
         success_rate=rate,
         collision_rate=1 - rate,
@@ -44,7 +49,7 @@ def result(version: int, rate: float, frames: float) -> Evaluation:
 
 def offer(best: BestWeights, version: int, rate: float, frames: float) -> None:
     weights = Weights.of(0, version, 10 * version, f"weights {version}".encode())
-    best.offer(weights, result(version, rate, frames))
+    best.offer(weights, [result(version, rate, frames)])
 
 
 def kept(path: Path) -> str:
@@ -84,7 +89,7 @@ def test_the_kept_weights_give_the_values_that_were_evaluated(path: Path, precis
     payload = weights_to_bytes(QNetwork("duel", view_px=32), SENT_AS[precision])
     weights = Weights.of(0, 1, 10, payload)
     evaluated.adopt(weights)
-    BestWeights(path).offer(weights, result(1, 0.5, 90))
+    BestWeights(path).offer(weights, [result(1, 0.5, 90)])
     kept_payload, manifest = read_weights(path)
     assert manifest["sha256"] == weights.digest
     states = np.random.default_rng(0).integers(0, 256, (5, 4, 32, 32), dtype=np.uint8)
@@ -119,13 +124,13 @@ def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 def test_the_best_is_confirmed_and_not_drawn_by_luck(
     path: Path, offers: list[tuple[float, float | None]], expected: int
 ) -> None:
-    again = {v: None if r is None else result(v, r, 50) for v, (_, r) in enumerate(offers)}
+    again = {v: [] if r is None else [result(v, r, 50)] for v, (_, r) in enumerate(offers)}
     best = BestWeights(path, lambda weights: again[weights.version])
     for version, (rate, _) in enumerate(offers):
         offer(best, version, rate, 50)
     assert kept(path) == f"weights {expected}"
     due = again[expected] if offers[expected][0] >= 0.9 else None
-    rate = offers[expected][0] if due is None else due.success_rate
+    rate = due[0].success_rate if due else offers[expected][0]
     assert read_weights(path)[1]["success_rate"] == rate
 
 
@@ -139,3 +144,39 @@ def test_it_is_confirmed_from_other_starts_as_many_as_configured() -> None:
     assert found.seed != config.evaluator.seed
     config = load_config("smoke", {**small, "evaluator.confirm_episodes": "0"}, environ={})
     assert WeightsEvaluator(confirming(config), "e").evaluate(weights, lambda: True) is None
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+@pytest.mark.parametrize(
+    ("offers", "expected"),
+    [
+        ([(0.9, 0.1), (0.5, 0.2)], 1),  # the number that succeeds least counts most
+        ([(0.9, 0.3), (1.0, 0.2)], 0),
+        ([(0.2, 0.0), (0.5, 0.0), (0.4, 0.0)], 1),  # then the mean
+        ([(0.3, 0.2), (0.2, 0.3)], 0),  # whichever number it is
+    ],
+)
+def test_of_several_numbers_the_weakest_decides(
+    path: Path, offers: list[tuple[float, float]], expected: int, restarts: bool
+) -> None:
+    best = BestWeights(path)
+    for version, rates in enumerate(offers):
+        weights = Weights.of(0, version, 10 * version, f"weights {version}".encode())
+        pairs = zip((1, 4), rates, strict=True)
+        best.offer(weights, [result(version, rate, 50, number) for number, rate in pairs])
+        best = BestWeights(path) if restarts else best
+    assert kept(path) == f"weights {expected}"
+    manifest = read_weights(path)[1]
+    assert manifest["success_rate"] == min(offers[expected])
+    assert manifest["success_by_robots"] == dict(zip("14", offers[expected], strict=True))
+
+
+def test_each_number_of_robots_is_evaluated_apart() -> None:
+    small = {"arena.view_px": "32", "arena.max_frames": "5", "evaluator.episodes": "3"}
+    config = load_config("smoke", {**small, "arena.robots": "[1, 3]"}, environ={})
+    weights = Weights.of(0, 1, 10, weights_to_bytes(QNetwork("duel", view_px=32)))
+    published: list[Evaluation] = []
+    found = AllNumbers(config, "evaluator-0", lambda: True)(weights, published.append)
+    assert [(e.num_robots, e.episodes) for e in found] == [(1, 3), (3, 3)]
+    assert published == found
+    assert AllNumbers(config, "evaluator-0", lambda: False)(weights) == []

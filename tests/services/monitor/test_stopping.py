@@ -5,6 +5,7 @@ import pytest
 from mrcdrl.common.config import RunConfig
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
 from mrcdrl.services.monitor.stopping import StoppingRule
+from mrcdrl.services.monitor.weakest import Weakest
 
 NOTHING = (0.0, 0)  # published
 WON, LOST = Outcome.SUCCESS, Outcome.COLLISION
@@ -14,13 +15,15 @@ def episode(outcome: Outcome) -> EpisodeSummary:
     return EpisodeSummary("actor-0", 0, 0, outcome, 100, 150.0, 1, 0.1, 5, 2.0)
 
 
-def evaluation(rate: float, epoch: int = 1, version: int = 1) -> Evaluation:
+def evaluation(
+    rate: float, epoch: int = 1, version: int = 1, num_robots: int = 2, worker: str = "0"
+) -> Evaluation:
     return Evaluation(
-        "0",
+        worker,
         epoch,
         version,
         100,
-        2,
+        num_robots,
         100,
         rate,
         1 - rate,
@@ -148,3 +151,30 @@ def test_patience_that_was_not_over_goes_on_counting_after_a_resume() -> None:
     for _ in range(20):
         rule.observe_episode(episode(LOST))
     assert rule.reason(0, 0.0, NOTHING) is not None
+
+
+def test_every_number_of_robots_has_to_reach_the_target() -> None:
+    rule = StoppingRule(RunConfig(target_success_rate=0.9), (1, 2, 4))
+    published = (1.0, 9)
+    for version, rates in enumerate([(0.99, 0.95, 0.5), (0.8, 0.9, 0.9), (0.9, 0.9, 0.9)], 1):
+        assert rule.reason(0, 0.0, published) is None
+        for number, rate in zip((1, 2, 4), rates, strict=True):
+            assert rule.reason(0, 0.0, published) is None, "not before all are tested"
+            rule.observe_evaluation(evaluation(rate, version=version, num_robots=number))
+    assert rule.reason(0, 0.0, published) is not None
+
+
+def test_the_weakest_is_that_of_one_version_and_one_evaluator() -> None:
+    weakest = Weakest((1, 4))
+    assert weakest.add(evaluation(0.9, version=1, num_robots=1, worker="a")) is None
+    assert weakest.add(evaluation(0.8, version=1, num_robots=4, worker="b")) is None
+    assert weakest.add(evaluation(0.7, version=2, num_robots=4, worker="a")) is None
+    found = weakest.add(evaluation(0.8, version=2, num_robots=1, worker="a"))
+    assert found is not None
+    assert (found.success_rate, found.num_robots) == (0.7, 4)
+    found = weakest.add(evaluation(0.6, version=1, num_robots=1, worker="b"))
+    assert found is not None
+    assert (found.success_rate, found.num_robots) == (0.6, 1)
+    for number in range(1000):
+        weakest.add(evaluation(0.5, worker=f"w{number}"))
+    assert len(weakest._pending) <= 64

@@ -16,7 +16,7 @@ from mrcdrl.common.errors import MrcdrlError
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, UInt8Array
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.state import RunState
-from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
+from mrcdrl.services.plots.figures import Path2D, by_robots, training_curve, trajectories
 from mrcdrl.services.plots.film import compose_frame, write_film
 from mrcdrl.services.plots.paper import Contender, arenas, comparison, curves
 
@@ -257,3 +257,19 @@ def test_films_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
     sizes = [np.zeros((64, 64, 3), np.uint8), np.zeros((32, 64, 3), np.uint8)]
     with pytest.raises(MrcdrlError, match="the first"):
         write_film(tmp_path / "sizes.mp4", sizes, 30)
+
+
+def test_each_number_of_robots_has_a_curve_of_its_own(tmp_path: Path) -> None:
+    with Recorder(tmp_path, CONFIG) as recorder:
+        state = RunState(CONFIG)
+        for step in range(6):
+            for number in (1, 2, 4):
+                judged = Evaluation("0", 1, step, 500 * step, number, 100, step / 9, 1 - step / 9,
+                                    0.0, (0.0, 1.0), 9.0, 9.0, 4.0, 9.0, 9.0, 1, 20.0)  # fmt: skip
+                recorder.record_evaluation(state.observe_evaluation(judged, 30.0 * step))
+    assert {n: len(own) for n, own in by_robots(state.evaluations).items()} == {1: 6, 2: 6, 4: 6}
+    training_curve(tmp_path, tmp_path / "curve.svg")
+    curves([tmp_path], tmp_path / "curves.svg")
+    for name in ("curve.svg", "curves.svg"):
+        drawn = (tmp_path / name).read_text("utf-8")
+        assert all(f"{number} robot" in drawn for number in (1, 2, 4))
