@@ -16,7 +16,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)  # on [-1, 1]
 
 
 def counts(arena: dict[str, Any]) -> tuple[int, int, int]:
-    """Robots, targets and obstacles in a scene of this configuration."""
+    """Robots, targets and obstacles in a record of this configuration, absent ones among them."""
     robots = arena["num_robots"]
     obstacles = len(arena["obstacles_px"]) + arena["num_obstacles"]
     return robots, arena["num_targets"] or robots, obstacles
@@ -49,19 +49,24 @@ def render(record: bytes, arena: dict[str, Any]) -> np.ndarray:
     for x, y, radius in discs:
         view.disc(x, y, radius - DISC_LOSS, OBSTACLE)
     half = arena["target_size_px"] / 2
-    for x, y in squares:
+    for x, y in present(squares):
         x, y = np.rint(x - half) + half, np.rint(y - half) + half
         view.bar((x - half, y), (x + half, y), half, TARGET)
     radius = arena["robot_radius_px"] - DISC_LOSS
-    for x, y, _ in others:
+    for x, y, _ in present(others):
         view.disc(x, y, radius, ROBOT)
-    for x, y, heading in others:
+    for x, y, heading in present(others):
         along = np.array([np.cos(heading), np.sin(heading)])
         start, end = (x, y) - HEADING_CAP * along, (x, y) + (radius + HEADING_CAP) * along
         view.bar(start, end, HEADING_HALF, HEADING)
     if arena["pixel_noise"] > 0:
         return noisy(view.image, np.frombuffer(record, "<u4")[-1:], arena["pixel_noise"])
     return view.image
+
+
+def present(rows: np.ndarray) -> np.ndarray:
+    """The rows of what is there: an absent robot's or target's numbers are NaN."""
+    return rows[np.isfinite(rows).all(axis=1)]
 
 
 def noisy(image: np.ndarray, seed: np.ndarray, deviation: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mrcdrl.common.arena import Scene, make_codec
+from mrcdrl.common.arena import ArenaBatch, Scene, make_codec
 from mrcdrl.common.arena.world.starts import test_starts as starts
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.model.q_network import Kind, QNetwork
@@ -53,6 +53,20 @@ def test_an_image_is_what_the_page_says_to_the_pixel(settings: dict[str, object]
             assert ours.max() == 255
             assert error.max() <= 1, "more than a rounding"
             assert (error > 0).mean() < 0.002
+
+
+@pytest.mark.parametrize("num_targets", [0, 4])
+def test_absent_robots_and_targets_are_not_in_an_image(num_targets: int) -> None:
+    config = ArenaConfig(robots=(1, 2, 4), num_targets=num_targets)
+    arenas, decode = ArenaBatch(config, [np.random.default_rng(0)]), make_codec(config).decode
+    numbers = set()
+    for _ in range(10):
+        records = arenas.reset(0).records[: arenas.present[0]]
+        numbers.add(len(records))
+        for record, ours in zip(records, decode(records), strict=True):
+            error = np.abs(foreign.render(record.tobytes(), config.model_dump()).astype(int) - ours)
+            assert error.max() <= 1
+    assert numbers == {1, 2, 4}
 
 
 @pytest.mark.parametrize("kind", ["duel", "ddqn", "dqn"])

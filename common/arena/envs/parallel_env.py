@@ -1,7 +1,9 @@
 """The arena as a PettingZoo ParallelEnv; every robot is an agent that sees its own images.
 
-Invariants: all robots live until the end of the episode. Success and too many collisions terminate
-it; the time limit truncates it. The same seed and actions give the same episodes in every process.
+Invariants: all robots live until the end of the episode. Where episodes differ in their number of
+robots, `agents` are those of the episode, and the absent ones have no observation. Success and too
+many collisions terminate it; the time limit truncates it. The same seed and actions give the same
+episodes in every process.
 """
 
 import sys
@@ -86,7 +88,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         if seed is not None:
             self._arenas = StackedArenas(self._config, [np.random.default_rng(seed)])
         time_step = self._arenas.reset(0, (options or {}).get("start"))
-        self.agents = self.possible_agents[:]
+        self.agents = self.possible_agents[: int(self._arenas.present[0])]
         self._render_in_terminal()
         return self._observations(), self._infos(time_step)
 
@@ -102,9 +104,10 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise ValueError(f"no action for {', '.join(missing)}")
-        chosen = np.array([[actions[agent] for agent in self.agents]])
-        time_step = self._arenas.step(chosen, _ONLY)[0]
         agents = self.agents
+        chosen = np.ones((1, len(self.possible_agents)), np.int64)
+        chosen[0, : len(agents)] = [actions[agent] for agent in agents]
+        time_step = self._arenas.step(chosen, _ONLY)[0]
         truncated = time_step.outcome is Outcome.TIMEOUT
         terminated = time_step.last and not truncated
         if time_step.last:
@@ -112,7 +115,7 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         self._render_in_terminal()
         return (
             self._observations(),
-            dict(zip(agents, time_step.rewards.tolist(), strict=True)),
+            dict(zip(agents, time_step.rewards.tolist(), strict=False)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             self._infos(time_step),
@@ -126,15 +129,20 @@ class ArenaParallelEnv(ParallelEnv):  # type: ignore[misc]
         """Does nothing; there is nothing to close."""
 
     def _observations(self) -> dict[str, UInt8Array]:
-        return dict(zip(self.possible_agents, self._arenas.states[0].copy(), strict=True))
+        states = self._arenas.states[0, : self._arenas.present[0]].copy()
+        return dict(zip(self.possible_agents, states, strict=False))
 
     def _infos(self, time_step: TimeStep) -> Infos:
         outcome = None if time_step.outcome is None else time_step.outcome.value
         hits = zip(time_step.collided.tolist(), time_step.hit_wall.tolist(), strict=True)
         return {
             agent: {"collided": collided, "hit_wall": hit_wall, "outcome": outcome}
-            for agent, (collided, hit_wall) in zip(self.possible_agents, hits, strict=True)
+            for agent, (collided, hit_wall) in zip(self._present(), hits, strict=False)
         }
+
+    def _present(self) -> list[str]:
+        """The agents of the episode, also once it has ended."""
+        return self.possible_agents[: int(self._arenas.present[0])]
 
     def _render_in_terminal(self) -> None:
         """Overwrites the previous image in the terminal, in the mode human."""

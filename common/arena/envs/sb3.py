@@ -2,9 +2,11 @@
 
 Invariants: the robots of an arena are adjacent and end together. The step that ends an episode
 returns the first states of the next one, and the last of the old one as `terminal_observation`.
+Where episodes differ in their number of robots, absent robots see black, get no reward and their
+actions are ignored; their infos say "present": False.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,7 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         self._agents = self._arenas[0].possible_agents
         self._actions: list[dict[str, int]] = []
         agent = self._agents[0]
+        self._black = np.zeros(self._arenas[0].observation_space(agent).shape, np.uint8)
         super().__init__(
             num_arenas * len(self._agents),
             self._arenas[0].observation_space(agent),
@@ -51,7 +54,7 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         states: list[UInt8Array] = []
         for number, arena in enumerate(self._arenas):
             observations, _ = arena.reset(self._seeds[number * len(self._agents)])
-            states += observations.values()
+            states += self._of_all(observations, self._black)
         self._reset_seeds()
         return np.stack(states)
 
@@ -68,17 +71,25 @@ class ArenaVecEnv(VecEnv):  # type: ignore[misc]
         infos: list[dict[str, Any]] = []
         for arena, actions in zip(self._arenas, self._actions, strict=True):
             observations, paid, terminated, truncated, arena_infos = arena.step(actions)
-            rewards += paid.values()
-            infos += arena_infos.values()
             ended = not arena.agents
+            rewards += self._of_all(paid, 0.0)
+            robots = self._of_all(arena_infos, None)
+            robots = [{"present": False} if info is None else info for info in robots]
+            infos += robots
             if ended:
-                for agent, info in arena_infos.items():
-                    info["terminal_observation"] = observations[agent]
-                    info["TimeLimit.truncated"] = truncated[agent] and not terminated[agent]
+                cut = any(truncated.values()) and not any(terminated.values())
+                lasts = self._of_all(observations, self._black)
+                for info, last in zip(robots, lasts, strict=True):
+                    info["terminal_observation"] = last
+                    info["TimeLimit.truncated"] = cut
                 observations, _ = arena.reset()
-            states += observations.values()
+            states += self._of_all(observations, self._black)
             ends += [ended] * len(self._agents)
         return np.stack(states), np.array(rewards, np.float32), np.array(ends), infos
+
+    def _of_all(self, values: Mapping[str, Any], absent: Any) -> list[Any]:
+        """The values of all robots of an arena; `absent` for those that are not there."""
+        return [values.get(agent, absent) for agent in self._agents]
 
     def close(self) -> None:
         """Does nothing; there is nothing to close."""

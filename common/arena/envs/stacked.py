@@ -7,6 +7,7 @@ image is repeated (paper section 4).
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mrcdrl.common.arena.batch import ArenaBatch
 from mrcdrl.common.arena.images.codec import make_codec
@@ -28,13 +29,18 @@ class StackedArenas:
         self.states: UInt8Array = np.zeros(shape, np.uint8)
         """States after the last time step [A, K, S, V, V]; the next step overwrites them."""
 
+    @property
+    def present(self) -> Int64Array:
+        """Robots of each arena's episode [A]; any others are absent, and their states black."""
+        return self._arenas.present
+
     def reset(self, arena: int, start: Start | None = None) -> TimeStep:
         """Begins an episode of an arena, as ArenaBatch does."""
         time_step = self._arenas.reset(arena, start)
         self.states[arena] = self._codec.decode(time_step.records)[:, None]
         return time_step
 
-    def step(self, actions: UInt8Array, arenas: Int64Array) -> TimeSteps:
+    def step(self, actions: ArrayLike, arenas: Int64Array) -> TimeSteps:
         """Plays one frame of these arenas [N], as ArenaBatch does; actions: [N, K]."""
         time_steps = self._arenas.step(actions, arenas)
         for age in range(self._config.stack - 1):

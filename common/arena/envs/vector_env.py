@@ -1,8 +1,10 @@
 """The arena as a Gymnasium VectorEnv for one shared policy; every robot is a sub-environment.
 
 Invariants: the robots of an arena are adjacent and end together, because they share its episode.
-The step after an end resets that arena, ignores its actions and gives reward 0
-(AutoresetMode.NEXT_STEP). The same seed and actions give the same episodes in every process.
+Where episodes differ in their number of robots, absent robots see black, get no reward, and their
+actions are ignored; `present` of the infos tells who is there. The step after an end resets that
+arena, ignores its actions and gives reward 0 (AutoresetMode.NEXT_STEP). The same seed and actions
+give the same episodes in every process.
 """
 
 from typing import Any, ClassVar
@@ -33,7 +35,7 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
     """Vector environment whose N robots fill several arenas.
 
     Observations: uint8 [N, stack, V, V]. Actions: [N] of 0 left, 1 straight, 2 right. infos, each
-    with a mask of the same name after an underscore: `collided` and `hit_wall`, bool [N];
+    with a mask of the same name after an underscore: `collided`, `hit_wall`, `present`, bool [N];
     `outcome`, object [N], "success", "collision" or "timeout" at an end, else None.
     """
 
@@ -138,9 +140,16 @@ class ArenaVectorEnv(VectorEnv[UInt8Array, Int64Array, Any]):
             "_collided": known,
             "hit_wall": np.concatenate([s.hit_wall for s in steps]),
             "_hit_wall": known,
+            "present": self._present(),
+            "_present": known,
             "outcome": np.repeat(outcomes, self._config.num_robots),
             "_outcome": self._each(np.array([s.last for s in steps])),
         }
+
+    def _present(self) -> BoolArray:
+        """Whether each robot [N] is there in its arena's episode."""
+        there = np.arange(self._config.num_robots) < self._arenas.present[:, None]
+        return np.asarray(there.reshape(-1), np.bool_)
 
     def _each(self, arenas: BoolArray) -> BoolArray:
         """Repeats a value per arena for each of its robots [N]."""

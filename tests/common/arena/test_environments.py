@@ -297,3 +297,41 @@ def test_the_example_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     example("parallel_env.py", 30).main(str(tmp_path / "film.gif"), max_cycles=5)
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF89a")
     assert "after 5 frames" in capsys.readouterr().out
+
+
+# -- episodes that differ in their number of robots ----------------------------------------
+
+MIXED = ArenaConfig(robots=(1, 2, 4), view_px=32, max_frames=5)
+
+
+@pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
+def test_pettingzoo_accepts_agents_that_are_there_in_some_episodes_only() -> None:
+    pettingzoo_tests.parallel_api_test(parallel_env.parallel_env(MIXED), num_cycles=100)
+    env, seen = parallel_env.parallel_env(MIXED), set()
+    for episode in range(20):
+        observations, infos = env.reset(seed=episode)
+        there = env.agents
+        seen.add(len(there))
+        assert there == env.possible_agents[: len(there)]
+        while env.agents:
+            assert list(observations) == list(infos) == there
+            observations, rewards, *_, infos = env.step(dict.fromkeys(there, 1))
+            assert list(rewards) == there
+    assert seen == {1, 2, 4}
+
+
+def test_absent_robots_of_the_vector_form_see_and_get_nothing() -> None:
+    envs = ArenaVectorEnv(3 * 4, MIXED)
+    states, infos = envs.reset(seed=0)
+    numbers = set()
+    for _ in range(60):
+        present = infos["present"]
+        numbers |= set(present.reshape(3, 4).sum(axis=1).tolist())
+        assert states[present].reshape(present.sum(), -1).any(axis=1).all()
+        assert not states[~present].any()
+        states, rewards, _, _, after = envs.step(np.ones(12, int))
+        stayed = ~present & ~after["present"]
+        assert not rewards[stayed].any()
+        assert not after["collided"][stayed].any()
+        infos = after
+    assert numbers == {1, 2, 4}

@@ -76,3 +76,18 @@ def test_the_example_trains(capsys: pytest.CaptureFixture[str]) -> None:
     assert model.num_timesteps >= 400
     assert model._n_updates > 0
     assert "episodes succeeded" in capsys.readouterr().out
+
+
+def test_absent_robots_see_and_get_nothing() -> None:
+    envs = ArenaVecEnv(2, ArenaConfig(robots=(1, 3), view_px=32, max_frames=2))
+    envs.seed(0)
+    states, numbers = envs.reset(), set()
+    for _ in range(30):
+        black = ~states.reshape(6, -1).any(axis=1)
+        states, rewards, ends, infos = envs.step(np.ones(6, np.int64))
+        present = np.array([info.get("present", True) for info in infos])
+        np.testing.assert_array_equal(present, ~black)
+        numbers |= set(present.reshape(2, 3).sum(axis=1).tolist())
+        assert not rewards[~present].any()
+        assert all("terminal_observation" in info for info in np.array(infos)[ends])
+    assert numbers == {1, 3}

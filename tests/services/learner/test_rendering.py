@@ -115,6 +115,20 @@ def test_the_device_renders_what_the_host_renders(compiled: Any, settings: dict[
 
 
 @pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
+def test_what_is_absent_is_not_rendered(compiled: Any, orientation: str) -> None:
+    config = arena(robots=(2, 4), orientation=orientation)
+    given = records(config, 50)
+    numbers = given.view("<f4")
+    numbers[:, :, 6:12] = numbers[:, :, 16:] = np.nan  # the last two robots and targets
+    alone = config.with_robots(2)
+    own = np.concatenate([numbers[:, :2, :6], numbers[:, :2, 12:16]], axis=2).view(np.uint8)
+    host = HostRenderer(make_codec(alone).decode)(own, ())
+    device = DeviceRenderer(config, "cpu", compiled(config))(given, ())
+    assert torch.equal(HostRenderer(make_codec(config).decode)(given[:, :2], ()), host)
+    assert largest_gap(host, device[:, :2]) <= 1
+
+
+@pytest.mark.parametrize("orientation", ["unrotated", "heading_up"])
 def test_headings_along_the_axes(compiled: Any, orientation: str) -> None:
     """Where cosines are 0 or nearly so; with walls, targets and robots on whole pixels."""
     config = arena(num_robots=4, orientation=orientation)
