@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
+from mrcdrl.common.config.schema import MOST_ROBOTS
+
 Kind = Literal["counter", "pace", "share", "gauge", "histogram"]
 Counter = Annotated[float, "counter"]  # rises while the process lives
 Pace = Annotated[float, "pace"]  # a counter whose rate is shown and recorded
@@ -20,6 +22,7 @@ Share = Annotated[float, "share"]  # of the time since the start, or a flag: wat
 Gauge = Annotated[float, "gauge"]  # as it is now
 NUM_BINS = 10
 Bins = Annotated[tuple[float, ...], "histogram"]  # share of each, sent as NAME_0 …; or ()
+ByRobots = Annotated[Mapping[int, float] | None, "gauge"]  # by number of robots, sent as NAME_1 …
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +46,8 @@ class ActorMetrics:
     draw_share: Share  # rendering images of records, and starting episodes
     chunk_share: Share  # cutting chunks and summing returns
     wait_share: Share  # waiting for room in the spool
+    success_by_robots: ByRobots = None  # of its latest episodes, where numbers differ
+    share_by_robots: ByRobots = None  # of the transitions that it is to make with each number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,6 +140,8 @@ def kinds(schema: type) -> dict[str, Kind]:
             found |= kinds(nested)
         elif hint == Bins:
             found |= {f"{name}_{i}": "histogram" for i in range(NUM_BINS)}
+        elif hint == ByRobots:
+            found |= {f"{name}_{number}": "gauge" for number in range(1, MOST_ROBOTS + 1)}
         else:
             found[name] = hint.__metadata__[0]
     return found
@@ -157,6 +164,8 @@ def numbers(metrics: Metrics | DiagnosticMetrics) -> dict[str, float]:
             found |= numbers(value)
         elif isinstance(value, tuple):
             found |= {f"{field.name}_{i}": share for i, share in enumerate(value)}
+        elif isinstance(value, Mapping):
+            found |= {f"{field.name}_{number}": item for number, item in value.items()}
         elif value is not None:
             found[field.name] = float(value)
     return found

@@ -120,6 +120,12 @@ class Actor:
         collector, seconds = self._collector, self._collector.seconds
         now = time.monotonic()
         lived_s = max(now - self._started_s, 1e-9)
+        curriculum, numbers = collector.curriculum, self._config.arena.numbers
+        by_robots: list[dict[int, float] | None] = [None, None]
+        if self._config.arena.mixes_numbers:
+            shares = curriculum.weights(self._policy.learner_step)
+            columns = (curriculum.success_rates.tolist(), shares.tolist())
+            by_robots = [dict(zip(numbers, column, strict=True)) for column in columns]
         return ActorMetrics(
             env_steps=collector.env_steps,
             robot_steps=collector.robot_steps,
@@ -138,6 +144,8 @@ class Actor:
             draw_share=seconds.draw / lived_s,
             chunk_share=seconds.chunk / lived_s,
             wait_share=self._waited_s / lived_s,
+            success_by_robots=by_robots[0],
+            share_by_robots=by_robots[1],
         )
 
 

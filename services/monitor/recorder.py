@@ -99,9 +99,10 @@ class Recorder(Closing):
             self._evaluations.flush()
         evaluation = record.evaluation
         mixed = self._config.arena.mixes_numbers
-        tag = f"evaluation/{evaluation.num_robots}_robots" if mixed else "evaluation"
+        which = f"{evaluation.num_robots}_robots/" if mixed else ""
         for name in EVALUATION_FIELDS:
-            self._event(f"{tag}/{name}", getattr(evaluation, name), evaluation.learner_step)
+            value = getattr(evaluation, name)
+            self._event(f"evaluation/{which}{name}", value, evaluation.learner_step)
 
     def record_metrics(self, state: RunState, now: float) -> None:
         """Write the metrics of this second and flush all files; call it once a second."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mrcdrl.common.config import Config
-from mrcdrl.common.messages.metrics import ActorMetrics, kinds
+from mrcdrl.common.messages.metrics import ActorMetrics, numbers, read
 from mrcdrl.common.messages.trajectory import (
     EpisodeSummary,
     InsertReply,
@@ -231,7 +231,7 @@ def _samples(config: Config, size: int) -> Samples:
 
 
 def _stats() -> Stats:
-    metrics = dict.fromkeys(kinds(ActorMetrics), 1.0)
+    metrics = dict.fromkeys(numbers(read(ActorMetrics, {})), 1.0)
     return Stats("actor", "actor-100", metrics, {"incarnation": "1" * 19})
 
 
