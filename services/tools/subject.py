@@ -67,7 +67,7 @@ class Subject:
         for place, part in enumerate(parts):
             arena, turns = part.config.arena, range(place, num, len(parts))
             starts, player = test_starts(arena, len(turns), seed), part.player(seed)
-            going = always(lambda done, before=len(played): report(before + done))
+            going = always(_after(len(played), report))
             results = play(arena, starts, player, keep_paths=True, keep_going=going) or []
             played |= zip(turns, results, strict=True)
         return [played[turn] for turn in range(num)]
@@ -102,9 +102,15 @@ def _say_other_robots(path: Path, own: str, config: Config) -> None:
     """Say so if the weights were trained with another number of robots; own: their run's file."""
     if own == DEFAULT_PRESET:
         return  # they are of no run
-    learned, now = load_config(own, environ={}).arena.num_robots, config.arena.num_robots
-    if learned != now:
-        _LOG.warning("%s: trained with %d robots, plays with %d", path, learned, now)
+    learned, now = load_config(own, environ={}).arena.numbers, config.arena.numbers
+    if not set(now) <= set(learned):
+        told = (", ".join(map(str, numbers)) for numbers in (learned, now))
+        _LOG.warning("%s: trained with %s robots, plays with %s", path, *told)
+
+
+def _after(before: int, report: Done) -> Done:
+    """Reports as many more."""
+    return lambda done: report(before + done)
 
 
 def always(report: Done) -> Callable[[int], bool]:

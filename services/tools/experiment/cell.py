@@ -148,6 +148,8 @@ class CellFiles:
             if weights is None or (target.exists() and _is_of(_read(target), self.cell)):
                 continue
             flags = ["--episodes", str(trial.episodes), "--seed", str(trial.seed), "--json"]
+            if self.cell.config.arena.mixes_numbers:
+                flags += ["--robots", str(self.cell.robots)]
             yield ["evaluate", str(weights), *flags], target
 
     def _weights(self, name: str) -> Path | None:
@@ -162,6 +164,8 @@ class CellFiles:
     def _collect(self, command: str) -> dict[str, Any]:
         summary, cell = self.summary, self.cell
         evaluations = read_evaluations(self.run)
+        if cell.config.arena.mixes_numbers:  # it is judged by the greatest number
+            evaluations = [r for r in evaluations if r.evaluation.num_robots == cell.robots]
         return {
             "cell": cell.name,
             "variant": cell.variant,

@@ -98,7 +98,8 @@ def _cells(table: dict[str, Any], folder: Path) -> Iterator[Cell]:
         fixed = {**budget, **dict.fromkeys(_SEEDED, seed)}
         if number is not None:
             fixed["arena.num_robots"] = number
-        for name in chosen.keys() & fixed.keys():
+        also = {"arena.robots"} if number is not None else set()
+        for name in chosen.keys() & (fixed.keys() | also):
             raise ConfigError(f"{where} sets {name}, which robots, seeds and [budget] set for all")
         try:
             texts = {name: json.dumps(value) for name, value in {**chosen, **fixed}.items()}

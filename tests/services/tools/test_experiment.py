@@ -178,6 +178,7 @@ WRONG = {
     "seeds": (("[0, 1]", "[0, 0]"), "seeds must be a list of different numbers"),
     "negative": (("[0, 1]", "[0, -1]"), "seeds must be whole numbers"),
     "settled": (("learner.batch", "run.seed = 3\nlearner.batch"), "sets run.seed"),
+    "numbers": (("learner.batch", "arena.robots = [1, 2]\nlearner.batch"), "sets arena.robots"),
     "budget": (("learner_steps = 100\nminutes = 2", "minutes = 0"), "would never end"),
     "budget key": (("minutes", "hours"), "'budget.hours'"),
     "own test": (("seed = 5", "seed = 1"), "evaluate.seed 1 is evaluator.seed"),

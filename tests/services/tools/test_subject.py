@@ -14,7 +14,8 @@ from mrcdrl.common.model.weights_files import write_weights
 from mrcdrl.common.model.weights_io import weights_to_bytes
 from mrcdrl.common.runtime.files import sha256
 from mrcdrl.services.evaluator.trial import ControllerPlayer, PolicyPlayer
-from mrcdrl.services.tools import flags
+from mrcdrl.services.tools import evaluate, flags
+from mrcdrl.services.tools.episode_frames import film_frames
 from mrcdrl.services.tools.subject import Subject, subject
 
 VIEW_PX = 32
@@ -133,3 +134,32 @@ def test_a_runs_weights_play_in_its_own_arena(
     assert named(tmp_path, "--robots", "2").config.arena.num_robots == 2
     assert caplog.messages.pop().endswith("trained with 4 robots, plays with 2")
     assert named(tmp_path, "--config", "smoke", VIEW).config.arena.num_robots == 2
+
+
+def test_several_numbers_of_robots_take_turns_and_are_tested_apart(
+    tmp_path: Path,
+    payload: bytes,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    settings = {"arena.robots": "[1, 4]", "arena.view_px": str(VIEW_PX), "arena.max_frames": "5"}
+    (tmp_path / "config.toml").write_text(to_toml(load_config("smoke", settings, {})))
+    write_weights(tmp_path / "checkpoints" / "best.safetensors", payload, {})
+    found = named(tmp_path)
+    assert [one.config.arena.num_robots for one in found.each_number()] == [1, 4]
+    done: list[int] = []
+    episodes = found.episodes(5, 0, done.append)
+    assert done == sorted(done)
+    assert [episode.robots.shape[1] for episode in episodes] == [4, 1, 4, 1, 4]
+    frames = list(film_frames(found.config.arena, episodes[:2]))
+    assert len({frame.shape for frame in frames}) == 1, "a film has one size"
+    assert evaluate.main([str(tmp_path), "--episodes", "3", "--json"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(line["num_robots"], line["episodes"]) for line in lines] == [(1, 3), (4, 3)]
+    assert evaluate.main([str(tmp_path), "--episodes", "3", "--json", "--robots", "4"]) == 0
+    (alone,) = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    del alone["wall_s"], lines[1]["wall_s"]
+    assert alone == lines[1]
+    assert not caplog.messages, "it has learned with that number"
+    named(tmp_path, "--robots", "3")
+    assert caplog.messages.pop().endswith("trained with 1, 4 robots, plays with 3")
