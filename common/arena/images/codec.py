@@ -89,8 +89,7 @@ class SceneCodec:
 
     def _scene_of(self, numbers: Float32Array) -> Scene:
         with np.errstate(invalid="ignore"):
-            known = np.nan_to_num(numbers.astype(np.float64))
-        near = np.clip(known, -_FARTHEST_PX, _FARTHEST_PX)
+            near = np.clip(numbers.astype(np.float64), -_FARTHEST_PX, _FARTHEST_PX)
         robots, targets, obstacles = np.split(near, self._ends)[:3]
         return Scene(robots.reshape(-1, 3), targets.reshape(-1, 2), obstacles.reshape(-1, 3))
 
