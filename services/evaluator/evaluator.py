@@ -91,7 +91,7 @@ class Evaluator:
         self._busy = False
 
     def _keep(self, weights: Weights, results: Sequence[Evaluation]) -> None:
-        """Keep the weights if they are the best; a full disk is no reason to stop evaluating."""
+        """Keep the weights if they are the best; a full disk does not end the evaluator."""
         try:
             self._best.offer(weights, results)
         except CheckpointError as error:
