@@ -183,9 +183,10 @@ def shared_memory_of(name: str) -> set[Path]:
 
 
 def error_line(stderr: str) -> str:
-    """The line that says what is wrong; log lines, with a time, may precede it."""
+    """The line that says what is wrong; log lines, with a time, and progress may precede it."""
     assert "Traceback" not in stderr, stderr
-    lines = [line for line in stderr.splitlines() if not re.match(r"\d{4}-\d\d-\d\d ", line)]
+    other = re.compile(r"\d{4}-\d\d-\d\d |\w+: \d+ of \d+")
+    lines = [line for line in stderr.splitlines() if not other.match(line)]
     assert len(lines) == 1, stderr
     assert lines[0].startswith("mrcdrl: "), stderr
     return lines[0]

@@ -2,10 +2,11 @@
 
 import json
 import os
+import signal
 import socket
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -68,12 +69,12 @@ SETTINGS = {
         ["min_size 50 exceeds capacity 10"],
     ),
     "no such preset": (["train", "--config", "papr"], ["papr", "paper", "quick"]),
-    "resume of nothing": (["train", "--resume", "nothing"], ["nothing", "is not a run"]),
+    "resume of nothing": (["train", "--resume", "nothing"], ["no run 'nothing'", "--run-dir"]),
     "resume with a name": (
         ["train", "--resume", "a", "--name", "b"],
         ["--resume", "--name"],
     ),
-    "a name that is a path": (["train", "--name", "../up"], ["run name", "../up"]),
+    "a name that is none": (["train", "--name", "a b"], ["run name", "a b"]),
 }
 
 
@@ -123,7 +124,7 @@ SUBJECTS = {
     "no episodes": (["--controller", "greedy", "--episodes", "0"], "at least 1"),
     "do not fit": (
         ["--controller", "greedy", "--robots", "10", "--arena.size_px", "200"],
-        "px",
+        "10 robots of radius 25 px do not fit",
     ),
     "an empty folder": (["."], "holds no weights"),
 }
@@ -212,7 +213,16 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: Path) -> None:
+def fill(disk: Path) -> None:
+    """Leave no room on a disk."""
+    with (disk / "ballast").open("wb", buffering=0) as ballast, suppress(OSError):
+        while True:
+            ballast.write(bytes(1 << 12))
+
+
+def test_a_run_outlives_a_full_disk_and_leaves_whole_checkpoints_only(
+    tmp_path: Path, small_disk: Path
+) -> None:
     name = run_name("full")
     run = small_disk / name
     arguments = smoke_training(small_disk, name)
@@ -220,8 +230,13 @@ def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: P
     try:
         with Command([*arguments, *more], tmp_path) as train:
             eventually(lambda: checkpoint.latest(run / "checkpoints"), "a checkpoint")
-            assert train.wait() > 0
-        assert "No space left on device" in error_line(train.err)
+            fill(small_disk)
+            failed = "recording failed: No space left on device; the run goes on"
+            eventually(lambda: failed in train.err, "a full disk")
+            train.signal(signal.SIGTERM)
+            assert train.wait() == 0, train.err
+        assert "not written: No space left on device" in train.err
+        assert "Traceback" not in train.err
         assert processes_of(name) == {}
     finally:
         end_all(name)
@@ -234,8 +249,7 @@ def test_a_full_disk_leaves_whole_checkpoints_only(tmp_path: Path, small_disk: P
 
 
 def test_a_disk_too_full_for_a_run_gets_none(tmp_path: Path, small_disk: Path) -> None:
-    with (small_disk / "ballast").open("wb") as ballast:
-        ballast.write(bytes(5 << 20))
+    fill(small_disk)
     line = refused(tmp_path, ["train", "--run-dir", small_disk, "--name", "none"])
     assert "No space left on device" in line
     assert not (small_disk / "none").exists()
