@@ -40,6 +40,8 @@ def main(argv: Sequence[str]) -> int:
     if arguments.out.suffix not in FORMATS:
         extension = arguments.out.suffix
         raise ConfigError(f"--out: unsupported extension {extension!r}; use {', '.join(FORMATS)}")
+    if arguments.out.suffix == ".onnx":
+        require_onnx()
     prepare_output(arguments.out)
     given = subject(arguments)
     with Progress() as progress:
@@ -117,11 +119,15 @@ def _dynamic() -> dict[int, torch.export.Dim]:
     return {0: torch.export.Dim("batch", min=1, max=65536)}
 
 
-def _pack_onnx(network: QNetwork, example: Tensor, metadata: str) -> bytes:
+def require_onnx() -> None:
+    """Raise ConfigError, naming the extra, if a package for ONNX is not installed."""
     if missing := [name for name in _ONNX_PACKAGES if importlib.util.find_spec(name) is None]:
         raise ConfigError(
             f".onnx needs {', '.join(missing)}: not installed, use pip install 'mrcdrl[export]'"
         )
+
+
+def _pack_onnx(network: QNetwork, example: Tensor, metadata: str) -> bytes:
     program = torch.onnx.export(
         network,
         (example,),

@@ -23,6 +23,7 @@ _SHOWN = (  # in the short help
     "arena.num_obstacles",
     "evaluator.epsilon",
 )
+_ONE_SUBJECT = f"a run (its name, its path, or {LATEST}) or a .safetensors file"
 _FIGURE = """Plot the paper's figures of any run, weights or controller.
 
 arena         Fig. 1: a start
@@ -90,7 +91,12 @@ def figure() -> Parser:
 
 def export() -> Parser:
     """The flags of `mrcdrl export`."""
-    made = _one_subject("export", "Write weights for other programs, checked on real images.")
+    text = "Write weights for other programs, checked on real images."
+    made = Parser(prog="mrcdrl export", description=text)
+    _add_weights(made, None, _ONE_SUBJECT)
+    made.set_defaults(controller=None)
+    add_run_dir(made)
+    add_config_flag(made, of_run=True)
     _add_out(made, "file to write: .onnx, .pt2 or .ts")
     made.add_argument("--json", action="store_true", help="print JSON")
     add_config_flags(made, ("arena.num_robots",))
@@ -100,14 +106,14 @@ def export() -> Parser:
 def _one_subject(command: str, description: str) -> Parser:
     """Make a parser with the flags that name weights or a controller, and its arena."""
     made = Parser(prog=f"mrcdrl {command}", description=description)
-    _add_weights(made, "?", f"a run (its name, its path, or {LATEST}) or a .safetensors file")
+    _add_weights(made, "?", _ONE_SUBJECT)
     _add_controller(made, "instead of weights: ", "store")
     add_run_dir(made)
     add_config_flag(made, of_run=True)
     return made
 
 
-def _add_weights(made: Parser, nargs: str, text: str) -> None:
+def _add_weights(made: Parser, nargs: str | None, text: str) -> None:
     completed_by(made.add_argument("weights", nargs=nargs, help=text), run_names)
 
 

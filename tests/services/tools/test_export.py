@@ -106,7 +106,6 @@ def test_a_file_of_other_values_is_not_written(
             ("{weights}", "--out", "policy.h5"),
             r"unsupported extension '.h5'; use .onnx, .pt2, .ts",
         ),
-        (("--controller", "greedy", "--out", "policy.ts"), "a controller cannot be exported"),
         (("{weights}", "--out", "/proc/policy.ts"), "cannot be written: No such file"),
     ],
 )
@@ -118,11 +117,19 @@ def test_what_cannot_be_exported_is_said(
         main([*words, *FLAGS])
 
 
+def test_a_controller_is_not_offered(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capsys.readouterr().out
+    assert "weights" in told
+    assert "--controller" not in told
+
+
 def test_without_its_packages_onnx_names_the_extra(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(
         ConfigError, match=r"needs onnx, onnxscript, onnxruntime: not installed.*mrcdrl\[export\]"
     ):
-        main([str(weights), "--out", str(tmp_path / "policy.onnx"), *FLAGS])
+        main(["none.safetensors", "--out", str(tmp_path / "policy.onnx"), *FLAGS])
