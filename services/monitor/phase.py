@@ -45,6 +45,11 @@ def thousands(number: float) -> str:
     return f"{number:,.0f}".replace(",", "\N{NO-BREAK SPACE}")
 
 
+def counted(number: float, noun: str) -> str:
+    """1 as "1 actor", 2 as "2 actors"."""
+    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
+
+
 def progress(state: RunState) -> Progress:
     """The phase, derived from who is up, how full replay is, and epsilon."""
     if state.ending:

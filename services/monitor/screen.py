@@ -18,7 +18,7 @@ from rich.text import Text
 
 from mrcdrl.common.runtime.names import printable
 from mrcdrl.services.monitor.bottleneck import bottleneck
-from mrcdrl.services.monitor.phase import Phase, progress, thousands
+from mrcdrl.services.monitor.phase import Phase, counted, progress, thousands
 from mrcdrl.services.monitor.records import SUCCESS_WINDOW
 from mrcdrl.services.monitor.service_table import ROLE_STYLES, services
 from mrcdrl.services.monitor.state import HISTORY_PERIOD, RunState
@@ -343,7 +343,7 @@ def plain_line(state: RunState, now: float) -> str:
     fields = [
         told(state, now),
         str(doing),
-        f"{len(state.alive('actor'))} actors",
+        counted(len(state.alive("actor")), "actor"),
         f"robot steps {state.robot_steps} ({state.per_second('robot_steps', now):.0f}/s)",
         f"replay {state.replay_size}/{state.replay_capacity}",
         f"learner steps {state.learner_steps} ({state.per_second('learner_steps', now):.0f}/s)",

@@ -15,7 +15,7 @@ from mrcdrl.common.messages.metrics import (
     LearnerMetrics,
     ReplayMetrics,
 )
-from mrcdrl.services.monitor.phase import thousands
+from mrcdrl.services.monitor.phase import counted, thousands
 from mrcdrl.services.monitor.state import WITHOUT_METRICS, RunState, Service
 
 QUIET_S = 5.0  # a service that reports nothing for this long is shown as silent
@@ -108,7 +108,7 @@ def figures(state: RunState, service: Service, now: float) -> str:
         case "evaluator":
             evaluator = service.read(EvaluatorMetrics)
             doing = "evaluating" if evaluator.busy else "waiting after"
-            done = f"{evaluator.evaluations:.0f} evaluations done"
+            done = f"{counted(evaluator.evaluations, 'evaluation')} done"
             refused = _refused(evaluator.weights_refused)
             return f"{doing} v{evaluator.weights_version:.0f} · {done}{refused}"
     return ""

@@ -134,6 +134,9 @@ def curves(run_dirs: Sequence[Path], out: Path) -> None:
         axes.set_xlim(0, max(SUCCESS_WINDOW, axes.get_xlim()[1]))
         if not any(len(line.get_xdata()) for line in axes.get_lines()):
             say(axes, "no records")
+        for line in axes.get_lines():
+            if len(line.get_xdata()) == 1 and line.get_marker() == "None":
+                line.set_marker("o")  # a line of one point is not seen
         axes.legend(loc="lower right", fontsize=8, framealpha=0.8)
     save(figure, out)
 

@@ -20,6 +20,7 @@ Done = Callable[[int], None]  # takes how many are done
 
 _BAR_PERIOD_S = 0.1
 _LINE_PERIOD_S = 10.0
+_TELLING_SHARE = 0.1  # before, the rate is that of compiling and of the first to end
 
 
 class Progress:
@@ -95,7 +96,7 @@ class Progress:
         if self._total == 1:
             return f"{self._stage} …"
         line = f"{self._stage}: {self._done} of {self._total}"
-        if 0 < self._done < self._total:
+        if _TELLING_SHARE * self._total <= self._done < self._total:
             spent_s = time.monotonic() - self._began_s
             line += f", about {spent_s * (self._total - self._done) / self._done:.0f} s left"
         return line

@@ -7,6 +7,7 @@ from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import Outcome
 from mrcdrl.common.runtime.files import prepare_output
 from mrcdrl.services.evaluator.trial import EpisodeResult
+from mrcdrl.services.monitor.phase import counted
 from mrcdrl.services.plots.figures import check_suffix
 from mrcdrl.services.plots.film import SUFFIXES, write_film
 from mrcdrl.services.tools import flags
@@ -37,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
         else:
             write_episodes(arguments.out, arena, results, progress)
     won = sum(result.outcome is Outcome.SUCCESS for result in results)
-    print(f"{arguments.out}: {len(results)} episodes, {won} successes")
+    print(f"{arguments.out}: {counted(len(results), 'episode')}, {won} succeeded")
     return 0
 
 
@@ -53,5 +54,5 @@ def write_episodes(
     note: which episodes these are.
     """
     images = film_frames(arena, results, note)
-    frames = progress.over(images, out.name, num_film_frames(results))
+    frames = progress.over(images, f"{out.name}, frames", num_film_frames(results))
     write_film(out, frames, FPS)

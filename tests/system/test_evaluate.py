@@ -72,7 +72,7 @@ def test_weights_are_judged_in_the_arena_of_their_run(finished: Finished, tmp_pa
 def test_render_makes_a_film(finished: Finished, tmp_path: Path) -> None:
     film = tmp_path / "films" / "film.mp4"
     said = printed(tmp_path, "render", finished.path, "--out", film, "--episodes", "1")
-    assert said.startswith(f"{film}: 1 episodes, ")
+    assert said.startswith(f"{film}: 1 episode, ")
     with av.open(film) as opened:
         frames = [frame.to_ndarray(format="rgb24") for frame in opened.decode(video=0)]
     assert len(frames) >= 10

@@ -206,6 +206,10 @@ def test_plain_line_before_anything_is_known() -> None:
     assert "evaluation –" in plain_line(RunState(CONFIG), 0.0)
 
 
+def test_one_actor_is_told_in_the_singular() -> None:
+    assert "  1 actor  " in plain_line(busy_state(1), 11.2)
+
+
 @pytest.mark.parametrize(
     ("points", "num", "expected"),
     [

@@ -18,6 +18,7 @@ from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.tools.figure import main
 
 VIEW_PX = 32
+FIRST_RUN = (0x12, 0x3C, 0x73)  # its colour among curves
 SHORT = {"arena.view_px": str(VIEW_PX), "arena.max_frames": "40"}
 FLAGS = [f"--{name}={value}" for name, value in SHORT.items()]
 
@@ -135,6 +136,19 @@ def test_curves_name_their_runs(tmp_path: Path, run_dir: Path) -> None:
     assert "<!-- empty -->" in text
     assert main(["curves", str(other), "--out", str(out)]) == 0
     assert "<!-- no records -->" in out.read_text("utf-8")
+
+
+def test_a_curve_of_one_point_is_seen(tmp_path: Path, run_dir: Path) -> None:
+    short = tmp_path / "short"
+    short.mkdir()
+    (short / "config.toml").write_text((run_dir / "config.toml").read_text("utf-8"), "utf-8")
+    first = (run_dir / "evaluations.jsonl").read_text("utf-8").splitlines(keepends=True)[0]
+    (short / "evaluations.jsonl").write_text(first, "utf-8")
+    curves = drawn(tmp_path / "one.png", "curves", short)
+    (short / "evaluations.jsonl").unlink()
+    assert share(curves, FIRST_RUN) > share(
+        drawn(tmp_path / "none.png", "curves", short), FIRST_RUN
+    )
 
 
 @pytest.mark.parametrize(

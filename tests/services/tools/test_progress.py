@@ -39,6 +39,18 @@ def test_without_a_terminal_each_stage_is_a_line(capsys: pytest.CaptureFixture[s
     assert told.out == ""
 
 
+def test_no_time_is_told_from_the_first_episodes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress_module, "_LINE_PERIOD_S", 0.0)
+    done = Progress().stage("episodes", 20)
+    done(1)
+    done(2)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1] == "episodes: 1 of 20", "the first to end took the compiling, too"
+    assert lines[2].startswith("episodes: 2 of 20, about ")
+
+
 def test_a_long_stage_says_how_far_it_is(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
