@@ -73,7 +73,7 @@ class ArenaConfig(Section):
     """Physics engine: compiled arrays, or pymunk, the reference; both give the same poses.
     (ours; ancestor: pymunk)"""
     num_robots: Annotated[int, Field(ge=1, le=MOST_ROBOTS)] = 2
-    """Robots in every episode; with robots, the greatest of its numbers. (paper: 2, 3, 4)"""
+    """Robots in every episode; if arena.robots is set, its greatest number. (paper: 2, 3, 4)"""
     robots: tuple[int, ...] = ()
     """Numbers of robots, such as [1, 2, 4], in rising order: each episode of training draws one, by
     the weights of [curriculum], and evaluations test each apart; empty: always num_robots. Of

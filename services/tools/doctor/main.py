@@ -56,7 +56,8 @@ def look_at_run(arguments: argparse.Namespace) -> tuple[list[Finding], Config | 
     try:
         joining = Joining.from_arguments(arguments)
     except EndpointError as error:
-        return [failed("endpoint", str(error), "start the run, or give --connect")], None
+        fix = "start it, or go on with it by `mrcdrl train --resume`; its logs/ say why it ended"
+        return [failed("endpoint", str(error), fix)], None
     return look(joining, StopSignal())
 
 
