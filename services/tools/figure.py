@@ -100,7 +100,7 @@ def _comparison(arguments: argparse.Namespace, progress: Progress) -> None:
     for other in subjects[1:]:
         for name in _WORLD:
             if getattr(other.config.arena, name) != getattr(world, name):
-                raise ConfigError(f"different arenas: give --arena.{name}, one value for all")
+                raise ConfigError(f"different arenas: arena.{name} differs; give --arena.{name}")
     num = arguments.episodes or 4
     rows = []
     for name, shown in zip(_names(arguments), subjects, strict=True):
