@@ -18,7 +18,7 @@ from mrcdrl.common.errors import DeadlineError, RunDirectoryError, UnreachableEr
 from mrcdrl.common.runtime.files import METRICS
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import StopSignal
-from mrcdrl.common.runtime.runs import is_run, run_path
+from mrcdrl.common.runtime.runs import LATEST, is_run, run_path
 from mrcdrl.common.runtime.versions import VERSIONED
 from mrcdrl.common.sync.joining import ENDPOINT_FILE, Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
@@ -93,6 +93,8 @@ def join(
 
     Raises UnreachableError, with what the run directory knows, if the run is not up.
     """
+    if not (arguments.run or arguments.connect or arguments.record):
+        arguments.run = LATEST
     wait_s = _WAIT_S if arguments.watch or arguments.record else 0.0
     deadline, told = time.monotonic() + wait_s, False
     while True:
@@ -157,7 +159,9 @@ def recall(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
 
 def parser() -> Parser:
     """The command's flags."""
-    made = joining_parser("status", "Show what a live run does, and its bottleneck.")
+    made = joining_parser(
+        "status", "Show what a live run does, and its bottleneck; without RUN, the latest."
+    )
     made.add_argument("--watch", action="store_true", help="keep showing it until stopped")
     made.add_argument("--json", action="store_true", help="as JSON, one object a line")
     made.add_argument(

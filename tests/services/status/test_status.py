@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mrcdrl.common.config import Config, TransportConfig, to_toml
-from mrcdrl.common.errors import RunDirectoryError, UnreachableError
+from mrcdrl.common.errors import ConfigError, RunDirectoryError, UnreachableError
 from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.files import RUN_CONFIG
@@ -134,6 +134,17 @@ def test_a_run_was_last_seen_when_it_last_recorded(tmp_path: Path) -> None:
     at_s = time.mktime((2026, 11, 29, 1, 20, 5, 0, 0, -1))
     os.utime(tmp_path / "run" / "metrics.jsonl", (at_s, at_s))
     assert last_seen(tmp_path / "run") == "last seen 2026-11-29 01:20:05, 0:01:10 after it began"
+
+
+def test_who_names_no_run_means_the_latest_but_records_none(tmp_path: Path) -> None:
+    recorded(tmp_path / "four", 70)
+    (tmp_path / "four" / "config.toml").touch()
+    asked = ["--run-dir", str(tmp_path)]
+    with ExitStack() as owned:
+        with pytest.raises(UnreachableError, match="run four is not up"):
+            join(parser().parse_args(asked), StopSignal(), owned)
+        with pytest.raises(ConfigError, match="give a run"):
+            join(parser().parse_args([*asked, "--record"]), StopSignal(), owned)
 
 
 def test_who_watches_a_run_that_is_not_up_is_told_at_once_and_waits(
