@@ -308,7 +308,7 @@ def evaluations(state: RunState, num_rows: int) -> Text:
             text.append(f"{e.num_robots:>2} robots ")
         text.append(f"{e.success_rate:6.1%} success", style="bold green")
         text.append(f" ({100 * low:.0f}–{100 * high:.0f})".ljust(9), style="grey62")
-        text.append(f"{e.collision_rate:6.1%} collision{e.timeout_rate:6.1%} time-out")
+        text.append(f"{e.collision_rate:6.1%} collision {e.timeout_rate:6.1%} time-out")
         text.append(f"  of {e.episodes}", style="grey62")
     return text if text else Text(f"  none {state.since or 'yet'}", style="grey62")
 

@@ -207,7 +207,7 @@ def test_live_screen_shows_the_run_outlives_kills_and_ends_at_ctrl_c(tmp_path: P
             terminal.read(lambda: metric(run, "learner_steps") >= 20, "learner steps")
             terminal.read(lambda: "% success" in terminal.text, "an evaluation")
             for word in (
-                *("mrcdrl", name, "actors", "replay", "learner", "evaluator", "robot steps"),
+                *("mrcdrl", name, "actor", "replay", "learner", "evaluator", "robot steps"),
                 *("env steps", "learner steps", "samples per insert", "ε", "weights v"),
                 *("successes in the last", "bottleneck", "evaluation", "left"),
             ):
