@@ -26,6 +26,8 @@ class MrcdrlError(Exception):
 class ConfigError(MrcdrlError):
     """A setting is unknown, impossible or contradicts another."""
 
+    exit_code = 2
+
 
 class RunDirectoryError(MrcdrlError):
     """A run directory exists already, is missing, or cannot be written."""

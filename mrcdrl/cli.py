@@ -115,7 +115,7 @@ COMMANDS = {
 EXIT_CODES = {
     0: "done; a run or service that a signal ended is done too",
     1: "failed, or a check of doctor did; stderr says why in one line",
-    2: "the command line is wrong; nothing was done",
+    2: "the command line or a setting is wrong; nothing was done",
     3: "learning diverged: a restarted learner would diverge again",
     130: "interrupted by Ctrl-C",
     141: "nobody reads the output any more",
