@@ -162,10 +162,12 @@ def test_a_second_launcher_is_refused_while_the_run_is_up(live: Live) -> None:
 
 def test_services_end_with_a_launcher_that_is_killed(live: Live) -> None:
     """The last of this file: the run ends here."""
-    services = processes_of(live.name, "-m mrcdrl", "--id")
-    assert {"learner", "actor"} <= {
-        role for role in ("learner", "actor") for line in services.values() if role in line
-    }
+
+    def up() -> bool:
+        services = processes_of(live.name, "-m mrcdrl", "--id").values()
+        return all(any(role in line for line in services) for role in ("learner", "actor"))
+
+    eventually(up, "a learner and an actor")
     os.kill(live.train.process.pid, signal.SIGKILL)
     assert live.train.wait() == -signal.SIGKILL
-    eventually(lambda: not processes_of(live.name), "its services end", 60)
+    eventually(lambda: not processes_of(live.name), "its services end")
