@@ -1,6 +1,6 @@
-"""Whether samples fit the run whose configuration the learner has; docs/wire.md.
+"""Whether transitions fit a run's configuration; docs/wire.md.
 
-Invariant: pure. Replay gives none that do not, but another process may answer in its place.
+Invariant: pure. Replay gives no samples that do not, but another process may answer in its place.
 """
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.returns import largest_n_step_return
 from mrcdrl.common.errors import WireError
-from mrcdrl.common.messages.trajectory import Samples
+from mrcdrl.common.messages.trajectory import Chunk, Samples
 
 
 class Fitting:
@@ -27,11 +27,16 @@ class Fitting:
                 f"records {list(samples.records.shape)} where {list(self._shape)} are due: "
                 "another run?"
             )
-        if int(samples.bootstrap_offsets.max()) > self._n_step:
-            raise WireError(f"a bootstrap offset exceeds agent.n_step, {self._n_step}")
-        largest = float(np.abs(samples.rewards).max())
-        if largest > self._largest_return:
-            raise WireError(
-                f"a return of {largest:g} where no arena of this run gives more than "
-                f"{self._largest_return:g}"
-            )
+        check_returns(samples, self._n_step, self._largest_return)
+
+
+def check_returns(transitions: Samples | Chunk, n_step: int, largest_return: float) -> None:
+    """Raise WireError for a return over too many steps, or one that no arena of the run gives."""
+    if int(transitions.bootstrap_offsets.max()) > n_step:
+        raise WireError(f"a bootstrap offset exceeds agent.n_step, {n_step}")
+    largest = float(np.abs(transitions.rewards).max())
+    if largest > largest_return:
+        raise WireError(
+            f"a return of {largest:g} where no arena of this run gives more than "
+            f"{largest_return:g}: other rewards?"
+        )

@@ -16,6 +16,7 @@ import numpy as np
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.returns import largest_n_step_return, largest_return
 from mrcdrl.common.errors import ConfigError, WireError
+from mrcdrl.common.messages.fitting import check_returns
 from mrcdrl.common.messages.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
 from mrcdrl.services.replay.capacity import TAILS_PER_CHUNK, capacity_of
 from mrcdrl.services.replay.sampler import Sampler, make_sampler
@@ -175,14 +176,7 @@ class Table:
                 f"records of {record_bytes} bytes, {tail} more than transitions, where "
                 f"{self._rows.shape[1]} and {self._window - 1} are due: another arena or agent?"
             )
-        if int(chunk.bootstrap_offsets.max()) > self._n_step:
-            raise WireError(f"a bootstrap offset exceeds agent.n_step, {self._n_step}")
-        largest = float(np.abs(chunk.rewards).max())
-        if largest > self._largest_return:
-            raise WireError(
-                f"a return of {largest:g} where no arena of this run gives more than "
-                f"{self._largest_return:g}: other rewards?"
-            )
+        check_returns(chunk, self._n_step, self._largest_return)
         if len(chunk) > self._capacity:
             raise WireError(f"{len(chunk)} transitions exceed the capacity {self._capacity}")
 
