@@ -17,6 +17,7 @@ from mrcdrl.common.messages.framing import Part
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.common.transport import PendingReply, Session
 from mrcdrl.common.transport.keys import Keys
 
@@ -187,5 +188,5 @@ class WeightsReader:
         """Count a message; log the 1st, 2nd, 4th, 8th …, as a peer may send many."""
         self._refused += 1
         self._ask_at_s = min(self._ask_at_s, time.monotonic() + _AFTER_REFUSAL_S)
-        if self._refused.bit_count() == 1:
+        if is_logged(self._refused):
             _LOG.warning("weights refused, %d so far: %s", self._refused, error)

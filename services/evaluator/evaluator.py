@@ -20,6 +20,7 @@ from mrcdrl.common.model.policy import make_policy
 from mrcdrl.common.model.weights_files import read_weights, write_weights
 from mrcdrl.common.runtime.files import BEST_WEIGHTS
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.sync.weights import WeightsReader
@@ -96,7 +97,7 @@ class Evaluator:
             self._best.offer(weights, results)
         except CheckpointError as error:
             self._failures += 1
-            if self._failures.bit_count() == 1:  # the 1st, 2nd, 4th …
+            if is_logged(self._failures):
                 _LOG.warning("%s (%d times so far)", error, self._failures)
 
     def _publish(self, result: Evaluation) -> None:

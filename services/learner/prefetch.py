@@ -16,6 +16,7 @@ from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.fitting import Fitting
 from mrcdrl.common.messages.trajectory import Samples
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.services.learner.accelerate.side_stream import on_side_stream
 from mrcdrl.services.learner.batch import Batch, collate, importance_exponent_at
 from mrcdrl.services.learner.learner import Learner
@@ -85,7 +86,7 @@ class Prefetcher:
                 batch = self._collate(samples)
             except WireError as error:
                 self.refused += 1
-                if self.refused.bit_count() == 1:  # the 1st, 2nd, 4th …, as a peer may send many
+                if is_logged(self.refused):
                     _LOG.warning("mini-batch refused, %d so far: %s", self.refused, error)
                 continue
             except Exception as error:  # noqa: BLE001  raised again by next, in the owner's thread

@@ -13,6 +13,7 @@ from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.model.saved_policy import read_saved, weights_path
 from mrcdrl.common.runtime.files import sha256
+from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.learner import Learner
@@ -87,7 +88,7 @@ class WeightsPublisher:
         except CheckpointError as error:
             self._saved_s = time.monotonic()
             self._failures += 1
-            if self._failures.bit_count() == 1:  # the 1st, 2nd, 4th …
+            if is_logged(self._failures):
                 _LOG.warning("%s (%d times so far); learning goes on", error, self._failures)
 
     def save(self) -> None:

@@ -11,6 +11,7 @@ from mrcdrl.common.messages.checks import MAX_REPORT_BYTES
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Stats
 from mrcdrl.common.messages.wire import decode_published
 from mrcdrl.common.runtime.names import is_name
+from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys, role_and_worker
 from mrcdrl.services.monitor.recorder import Recorder
@@ -126,7 +127,7 @@ class Follower:
             self._check_sender(message)
         except WireError as error:
             self._refused += 1
-            if self._refused.bit_count() == 1:  # the 1st, 2nd, 4th …, as a peer may send many
+            if is_logged(self._refused):
                 _LOG.warning(
                     "%s message refused, %d so far: %s", cls.__name__, self._refused, error
                 )

@@ -22,6 +22,7 @@ from mrcdrl.common.messages.trajectory import (
 )
 from mrcdrl.common.messages.wire import decode, encode, encode_parts
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.common.transport import Client, PendingReply, Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.replay.capacity import table_bytes
@@ -130,7 +131,7 @@ class ReplayWriter:
         if before is None or reply.inserts >= before + stored:
             return
         self.uncounted += 1
-        if self.uncounted.bit_count() == 1:
+        if is_logged(self.uncounted):
             _LOG.warning(
                 "%s acknowledged %d transitions, but counts %d where it had %d: it has lost its "
                 "log, or another process answers in its place and stores nothing",
