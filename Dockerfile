@@ -1,5 +1,5 @@
 # An image for each service: `docker build --target replay .`; `docker compose build` makes all.
-# Replay, router and status work without PyTorch, and their images are small.
+# Replay, router, status and web work without PyTorch, and their images are small.
 ARG PYTHON=python:3.11-slim-bookworm
 
 # Wheels for pip to prefer, such as another build of PyTorch: `--build-context wheels=FOLDER`.
@@ -26,11 +26,16 @@ RUN pip --python /opt/mrcdrl/bin/python install --no-compile . \
  && find pygments/lexers -name '*.py' ! -name '_*.py' ! -name python.py -delete
 COPY common common
 COPY services services
+COPY docs/metrics.md docs/metrics.md
 COPY configs configs
 COPY mrcdrl mrcdrl
 RUN pip --python /opt/mrcdrl/bin/python install --no-compile --no-deps --force-reinstall . \
  && /opt/mrcdrl/bin/python -c "import mrcdrl.cli, mrcdrl.common.runtime.heartbeat, mrcdrl.services.replay.main, \
       mrcdrl.services.replay.inspect.main, mrcdrl.services.router.main, mrcdrl.services.status.main"
+
+FROM small-installed AS web-installed
+RUN pip --python /opt/mrcdrl/bin/python install --no-compile starlette uvicorn sse-starlette \
+ && /opt/mrcdrl/bin/python -c "import mrcdrl.services.web.main"
 
 FROM small-installed AS certs-installed
 RUN pip --python /opt/mrcdrl/bin/python install cryptography
@@ -101,6 +106,10 @@ CMD ["replay", "--help"]
 
 FROM small AS status
 CMD ["status", "--help"]
+
+FROM service AS web
+COPY --from=web-installed /opt/mrcdrl /opt/mrcdrl
+CMD ["web", "--help"]
 
 FROM learning AS actor
 CMD ["actor", "--help"]

@@ -11,7 +11,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TORCH = --no-deps $$(grep '^torch==' constraints.txt)
 NO_TORCH = $(TORCH_INDEX) has no PyTorch for this machine, or cannot be reached: taking that of pip's index
 
-.PHONY: install train test lint format bench wheel clean
+.PHONY: install train test lint docs format bench wheel clean
 
 install: $(VENV)/installed
 
@@ -35,6 +35,14 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# The documentation as a site in build/docs; a warning fails it. The first call installs what it takes.
+docs: $(VENV)/docs-installed
+	$(BIN)/python -m sphinx --quiet --fail-on-warning -c docs -d build/doctrees . build/docs
+
+$(VENV)/docs-installed: $(VENV)/installed
+	$(PIP) -c constraints.txt -e '.[docs]'
+	touch $@
 
 format: install
 	$(BIN)/ruff format .

@@ -31,7 +31,8 @@ from mrcdrl.common.messages.trajectory import Chunk, Priorities, SampleRequest, 
 from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.transport import PendingReply, Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
-from tests.system.system_processes import Command, end_all, eventually, run_name
+from tests.patience import eventually
+from tests.system.system_processes import Command, end_all, run_name
 
 IN_FLIGHT = 32
 GOOD_EVERY = 50

@@ -157,7 +157,7 @@ class HostileMessages:
         if cls is EpisodeSummary:
             real = name == "actor-0"
             outcome, epsilon = rng.choice(list(Outcome)), 2.0 if real else 0.1
-            return EpisodeSummary(name, 0, 1, outcome, 9, 1.5, 0, epsilon, 1, 1e38)
+            return EpisodeSummary(name, 0, 1, outcome, 9, 1.5, 0, epsilon, 1, 1e38, 2)
         if cls is Evaluation:
             epoch = rng.choice((0, 1, 2**63 - 1))
             worker = "x1" if name == "evaluator-0" else name

@@ -40,7 +40,8 @@ from mrcdrl.common.messages.trajectory import (
 )
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.records import read_evaluations, read_last_metrics
-from tests.system.system_processes import SMALL, Command, end_all, eventually, run_name
+from tests.patience import eventually
+from tests.system.system_processes import SMALL, Command, end_all, run_name
 
 RATE = 400.0  # messages a second at most: the run has to have cores left
 ENDLESS = ("--learner-steps", "100000000", "--run.target_success_rate", "0.9")

@@ -28,12 +28,12 @@ from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.sync.live_policy import LivePolicy
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
+from tests.patience import eventually
 from tests.system.system_processes import (
     REPOSITORY,
     Command,
     end_all,
     environment,
-    eventually,
     run_name,
 )
 

@@ -38,8 +38,8 @@ from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.evaluator.evaluator import WeightsEvaluator
-from tests.patience import PATIENCE_S
-from tests.system.system_processes import Command, end_all, eventually, run_name
+from tests.patience import PATIENCE_S, eventually
+from tests.system.system_processes import Command, end_all, run_name
 
 SMALL_RUN = (
     "--arena.num_robots=1",

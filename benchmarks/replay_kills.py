@@ -35,12 +35,12 @@ from mrcdrl.common.errors import DeadlineError
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.replay.inspect.contents import Contents, log_directory, read_contents
+from tests.patience import eventually
 from tests.system.system_processes import (
     REPOSITORY,
     Command,
     end_all,
     environment,
-    eventually,
     run_name,
 )
 

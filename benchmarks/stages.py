@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import emit, seconds_per_call, spread
-from mrcdrl.common.arena import ArenaBatch, layout_symmetries, make_codec
+from mrcdrl.common.arena import ArenaBatch, make_codec
 from mrcdrl.common.config import Config, TransportConfig, load_config
 from mrcdrl.common.messages.trajectory import Chunk
 from mrcdrl.common.model.policy import make_policy
@@ -23,6 +23,7 @@ from mrcdrl.services.actor.collector import Collector
 from mrcdrl.services.learner.batch import collate
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.rendering import make_renderer
+from mrcdrl.services.learner.symmetries import LayoutSymmetries
 from mrcdrl.services.replay.client import ReplayReader, ReplayWriter
 from mrcdrl.services.replay.limiter import RateLimiter
 from mrcdrl.services.replay.service import ReplayService
@@ -57,7 +58,9 @@ def make_collector(config: Config) -> Collector:
     arenas = ArenaBatch(config.arena, rngs)
     chunking = ChunkerConfig.from_config(config, "bench", incarnation=1)
     rng = np.random.default_rng(0)
-    return Collector(config, chunking, arenas, make_codec(config.arena), make_policy(config), rng)
+    return Collector(
+        config, chunking, arenas, make_codec(config.arena), make_policy(config, averages=False), rng
+    )
 
 
 def collecting(config: Config, collector: Collector, timing: dict[str, float]) -> dict[str, object]:
@@ -118,10 +121,11 @@ def learning(config: Config, chunks: list[Chunk], timing: dict[str, float]) -> d
     if sampled is None:
         raise RuntimeError("no mini-batch came")
     render = make_renderer(config.arena, learner.device)
-    symmetries = layout_symmetries(config.arena)
+    symmetries = LayoutSymmetries(config.arena)
 
     def collated() -> object:
-        return collate(sampled, render, config.arena.stack, symmetries=symmetries, rng=learner.rng)
+        drawn = symmetries.draw(sampled.records, learner.rng)
+        return collate(sampled, render, config.arena.stack, symmetry_rows=drawn)
 
     batch = collate(sampled, render, config.arena.stack)
     return {

@@ -29,7 +29,8 @@ from mrcdrl.common.runtime.process import ALLOCATOR
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.train.launcher import num_actors
-from tests.system.system_processes import Command, end_all, eventually, run_name
+from tests.patience import eventually
+from tests.system.system_processes import Command, end_all, run_name
 
 PHASES = ("actors and evaluator", "actors", "alone")
 _TUNED = "one thread, allocator tuned"  # like our learner on two cores

@@ -20,7 +20,6 @@ Each name is imported on first use, so `import mrcdrl` alone loads neither PyTor
 whose extra is not installed raises ImportError.
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -75,13 +74,10 @@ def __getattr__(name: str) -> object:
     if name == "__version__":
         from importlib.metadata import version
 
-        value: object = version("mrcdrl")
-    elif name in _MODULES:
-        value = getattr(importlib.import_module(f"mrcdrl.{_MODULES[name]}"), name)
-    else:
-        raise AttributeError(f"module 'mrcdrl' has no attribute {name!r}")
-    globals()[name] = value
-    return value
+        return globals().setdefault(name, version("mrcdrl"))
+    from mrcdrl.common.runtime.lazy import imported
+
+    return imported(__name__, _MODULES, name)
 
 
 def __dir__() -> list[str]:

@@ -49,6 +49,11 @@ COMMANDS = {
         "services.train.flags:parser",
     ),
     "experiment": Command("services.tools.experiment.main", "train a grid: settings and seeds"),
+    "reproduce": Command(
+        "services.tools.reproduce.main",
+        "train for the paper's tables and figures, and report",
+        "services.tools.reproduce.flags:parser",
+    ),
     "runs": Command("services.tools.runs", "show the runs in a folder: state, success, disk"),
     "runs rm": Command("services.tools.runs_rm", "remove runs, after asking"),
     "evaluate": Command(
@@ -86,6 +91,9 @@ COMMANDS = {
     ),
     "replay inspect": Command("services.replay.inspect.main", "show what a run's replay log holds"),
     "status": Command("services.status.main", "show what a live run does, and its bottleneck"),
+    "web": Command(
+        "services.web.main", "show runs in a browser, live", "services.web.flags:parser"
+    ),
     "doctor": Command(
         "services.tools.doctor.main",
         "check this machine and a run, and say how to fix what is wrong",

@@ -5,6 +5,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
@@ -12,6 +13,10 @@ from hypothesis import settings
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.services.tools.certs import HOSTS, ROLES
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SLOW = ("compose", "chaos", "system", "packaging")  # folders of tests that start runs
 MAX_WORKERS = 4  # each may start a run, whose processes fill several cores
 
@@ -53,6 +58,15 @@ def cpp_compiler() -> str:
 
 
 @pytest.fixture(scope="session")
+def promtool() -> str:
+    """Prometheus' own check of metrics, rules and configurations."""
+    found = shutil.which("promtool")
+    if found is None:
+        pytest.skip("NO PROMTOOL: WHAT PROMETHEUS IS GIVEN IS NOT CHECKED (apt install prometheus)")
+    return found
+
+
+@pytest.fixture(scope="session")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A directory with an authority and all roles, as `mrcdrl certs` makes it."""
     from mrcdrl.services.tools.certificates import make  # only here is cryptography needed
@@ -60,3 +74,17 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("certificates")
     make(folder, ROLES, HOSTS, datetime.timedelta(days=1))
     return folder
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator["Browser"]:
+    """Chromium, without windows, one for all tests: Playwright cannot start twice in a process."""
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip("NO CHROMIUM: THE PAGE IS NOT TESTED IN A BROWSER (apt-get install chromium)")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield started
+        started.close()

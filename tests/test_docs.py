@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -19,12 +20,14 @@ import numpy as np
 import pytest
 import torch
 
+import mrcdrl
 from mrcdrl import cli
 from mrcdrl.common.arena.controllers import CONTROLLERS
 from mrcdrl.common.config import Config, TransportConfig, preset_names
 from mrcdrl.common.messages.checks import RANGES
 from mrcdrl.common.messages.metrics import SCHEMAS, kinds
 from mrcdrl.common.messages.trajectory import (
+    ArenaFrame,
     Chunk,
     EpisodeSummary,
     Evaluation,
@@ -42,10 +45,17 @@ from mrcdrl.common.messages.trajectory import (
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.runtime.files import MOVING_PICTURE, PICTURES
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.evaluator.navigation import Navigation, RobotNavigation
-from mrcdrl.services.monitor.recorder import EVALUATION_FIELDS, RATES, flat_metrics
+from mrcdrl.services.monitor.recorder import (
+    EVALUATION_FIELDS,
+    HISTOGRAMS,
+    RATES,
+    RESULTS,
+    flat_metrics,
+)
 from mrcdrl.services.monitor.records import EpisodeRecord, EvaluationRecord
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.summary import summary
@@ -58,6 +68,8 @@ from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
+PROSE = "\n".join(path.read_text("utf-8") for path in PAGES)
 README = (ROOT / "README.md").read_text("utf-8")
 MESSAGES = (
     Chunk,
@@ -72,6 +84,7 @@ MESSAGES = (
     EpisodeSummary,
     Evaluation,
     Stats,
+    ArenaFrame,
 )
 
 
@@ -118,9 +131,20 @@ def test_configuration_is_up_to_date() -> None:
     assert page("configuration.md") == generate().render(), "run: python docs/generate.py"
 
 
+def test_commands_are_up_to_date() -> None:
+    assert page("commands.md") == generate().render_commands(), "run: python docs/generate.py"
+
+
 def test_tables_of_scaling_are_up_to_date() -> None:
     written = page("scaling.md")
     assert generate().render_scaling(written) == written, "run: python docs/generate.py"
+
+
+def test_tables_of_metrics_are_up_to_date() -> None:
+    for name in ("metrics", "monitoring"):
+        written = page(f"{name}.md")
+        rendered = getattr(generate(), f"render_{name}")(written)
+        assert rendered == written, "run: python docs/generate.py"
 
 
 def test_settings_named_in_the_docs_exist() -> None:
@@ -287,6 +311,9 @@ def test_tensorboard_tags_are_documented() -> None:
                 tags.add(str(tag.value))
             else:
                 assert ast.unparse(tag)[2:].split("/")[0] in {"evaluation", "rates", "learner"}
+    assert set(RESULTS) <= tags
+    tags |= {f"learner/{name}" for name in HISTOGRAMS} | {"configuration"}
+    tags |= {f"run/{Path(name).stem}" for name in (*PICTURES, MOVING_PICTURE)}
     assert set(names(part(page("metrics.md"), "## TensorBoard"))) == tags
 
 
@@ -393,6 +420,14 @@ def test_the_pages_to_start_from_are_linked() -> None:
         assert name == "architecture.md" or f"({name})" in page("architecture.md")
 
 
+# -- the Python API ----------------------------------------------------------------------
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    directives = re.findall(r"^\.\. auto\w+:: mrcdrl\.(\w+)\b(?!\.)", page("api.md"), re.M)
+    assert sorted(directives) == sorted(set(mrcdrl.__all__) - {"__version__"})
+
+
 # -- commands ----------------------------------------------------------------------------
 
 
@@ -402,9 +437,8 @@ def test_every_command_is_in_the_readme() -> None:
 
 
 def command_lines() -> list[str]:
-    """Lines of the README and the docs that begin with mrcdrl, in blocks of shell."""
-    text = "\n".join([README, *(path.read_text("utf-8") for path in sorted(DOCS.glob("*.md")))])
-    blocks = re.findall(r"```sh\n(.*?)```", text, re.S)
+    """Lines of all pages that begin with mrcdrl, in blocks of shell."""
+    blocks = re.findall(r"```sh\n(.*?)```", PROSE, re.S)
     return [line for block in blocks for line in block.splitlines() if line.startswith("mrcdrl ")]
 
 
@@ -420,11 +454,16 @@ def test_command_and_its_flags_exist(line: str) -> None:
 def test_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text("utf-8")
     targets = set(re.findall(r"^([a-z]+):", makefile, re.M))
-    named = set(re.findall(r"(?:^|`)make ([a-z]+)", README, re.M))
-    assert {"train", "test"} <= named <= targets
+    named = set(re.findall(r"(?:^|`)make ([a-z]+)(?=`| +[#A-Z]|$)", PROSE, re.M))
+    assert {"train", "test", "docs"} <= named <= targets
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=str)
+def test_the_citation_is_of_this_version() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+
+
+@pytest.mark.parametrize("path", PAGES, ids=str)
 def test_links_and_files_exist(path: Path) -> None:
     text = path.read_text("utf-8")
     for target in re.findall(r"\]\(([^)#]+)\)", text):

@@ -41,6 +41,7 @@ FLOORS = (
     ),
     ("services/monitor",),
     ("services/plots",),
+    ("services/web",),
     ("services/train", "services/status", "services/tools"),
     ("mrcdrl",),
 )
@@ -76,7 +77,13 @@ PLACES = {
     "matplotlib": ("services/plots",),
     "av": ("services/plots",),
     "tensorboardX": ("services/monitor",),
+    "prometheus_client": ("common/sync", "services/monitor", "services/web/scraping.py"),
+    "starlette": ("services/web",),
+    "uvicorn": ("services/web",),
+    "sse_starlette": ("services/web",),
+    "anyio": ("services/web",),
     "onnxruntime": ("services/tools/export.py",),
+    "markdown_it": ("services/tools/reproduce/page.py",),
     "rerun": ("services/tools/rerun_recording.py",),
     "rich": (
         "services/monitor",
@@ -207,7 +214,8 @@ def modules_after(statement: str) -> set[str]:
 
 
 HEAVY = {"torch", "cv2", "numba", "pymunk", "matplotlib", "av", "safetensors", "rich"}
-LIGHT = {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}
+ARENA_ONLY = {"cv2", "pymunk"}  # of the extra `arena`; with `learn` alone, policies act
+LIGHT = {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack", "prometheus_client"}
 
 
 @pytest.mark.parametrize(
@@ -217,11 +225,15 @@ LIGHT = {*HEAVY, "zenoh", "numpy", "pydantic", "msgpack"}
         ("mrcdrl.services.train.flags", {*HEAVY, "zenoh", "numpy"}),
         ("mrcdrl.services.tools.flags", {*HEAVY, "zenoh", "numpy"}),
         ("mrcdrl.common.runtime.heartbeat", LIGHT),
-        ("mrcdrl.services.replay.main", HEAVY),
+        ("mrcdrl.services.replay.main", {*HEAVY, "prometheus_client"}),
         ("mrcdrl.services.replay.client", HEAVY),
         ("mrcdrl.services.train.main", {"torch", "safetensors"}),
+        ("mrcdrl.common.model.saved_policy", {*ARENA_ONLY, "zenoh"}),
+        ("mrcdrl.common.sync.live_policy", ARENA_ONLY),
         ("mrcdrl.services.status.main", HEAVY - {"rich"}),
-        ("mrcdrl.services.tools.simulate.main", HEAVY),
+        ("mrcdrl.services.web.main", HEAVY - {"rich"}),
+        ("mrcdrl.services.web.flags", {*HEAVY, "zenoh", "numpy", "starlette"}),
+        ("mrcdrl.services.tools.simulate.main", HEAVY - {"rich"}),
         ("mrcdrl.services.tools.doctor.main", HEAVY - {"rich"}),
     ],
 )

@@ -18,8 +18,12 @@ CODE = sorted(
     if path.suffix in {".py", ".cu", ".toml", ".json5"}
 )
 PROSE = [
-    Path("README.md"),
-    *sorted(path.relative_to(ROOT) for path in (ROOT / "docs").glob("*.md")),
+    *(Path(name) for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+    *sorted(
+        path.relative_to(ROOT)
+        for folder in ("docs", "docs/tutorials")
+        for path in (ROOT / folder).glob("*.md")
+    ),
 ]
 DANGLING = {"as", "at", "by", "for", "from", "in", "of", "that", "to", "which", "whose", "with"}
 BANNED = re.compile(r"(?<!there )\bis no (?!longer\b)|\bfor ever\b|\b(un)?mend(s|ed|ing)?\b", re.I)

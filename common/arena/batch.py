@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mrcdrl.common.arena.counting import CountingBatch
+from mrcdrl.common.arena.envs.custom_batch import CustomBatch
 from mrcdrl.common.arena.images.sensors import Sensors
 from mrcdrl.common.arena.world.layout import layout_for
 from mrcdrl.common.arena.world.physics import ArrayPhysics, Physics
 from mrcdrl.common.arena.world.pymunk_physics import PymunkPhysics
-from mrcdrl.common.arena.world.rewards import frame_rewards
+from mrcdrl.common.arena.world.rewards import drawn_to_occupied, frame_rewards
 from mrcdrl.common.arena.world.scene import Scene, Start, checked_actions
 from mrcdrl.common.arena.world.starts import training_start
 from mrcdrl.common.config import ArenaConfig
@@ -144,6 +145,10 @@ class ArenaBatch:
 
         return assigned_distances_px(self._scenes(arenas), ~self.failed[arenas])
 
+    def drawn_to_occupied(self, arenas: Int64Array) -> BoolArray:
+        """Whether another robot is nearer to a robot's nearest target, in these arenas [N, K]."""
+        return drawn_to_occupied(self._scenes(arenas))
+
     def _fail(self, arenas: Int64Array) -> None:
         """Draws which robots fail in this frame; the last working robot never does."""
         probability = self._config.failure_probability
@@ -193,13 +198,17 @@ class ArenaBatch:
         self.present[arena] = number
 
 
+Arenas = ArenaBatch | CountingBatch | CustomBatch
+"""What an actor steps."""
+
+
 def make_arenas(
     config: ArenaConfig, rngs: Sequence[np.random.Generator], identities: Sequence[int]
-) -> ArenaBatch | CountingBatch:
+) -> Arenas:
     """The arenas that config.kind names. identities: the numbers in counting arenas' images."""
     if config.kind == "counting":
         return CountingBatch(config, identities)
-    return ArenaBatch(config, rngs)
+    return CustomBatch(config, rngs) if config.is_custom else ArenaBatch(config, rngs)
 
 
 def _make_physics(config: ArenaConfig, num_arenas: int) -> Physics:

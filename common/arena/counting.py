@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from mrcdrl.common.arena.world.scene import Scene, Start, checked_actions
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import (
+    BoolArray,
     Float64Array,
     Int64Array,
     Outcome,
@@ -137,6 +138,10 @@ class CountingBatch:
     def __len__(self) -> int:
         return len(self._arenas)
 
+    def scene(self, arena: int) -> Scene:
+        """The scene of an arena."""
+        return self._arenas[arena].scene
+
     def reset(self, arena: int, start: Start | None = None) -> TimeStep:
         """Begins the next episode of an arena."""
         return self._arenas[arena].reset(start)
@@ -156,6 +161,10 @@ class CountingBatch:
     def assigned_distances_px(self, arenas: Int64Array) -> Float64Array:
         """Zeros [N, K]: robots and targets stay at the origin."""
         return np.zeros((len(arenas), self._num_robots))
+
+    def drawn_to_occupied(self, arenas: Int64Array) -> BoolArray:
+        """False, [N, K]: nobody occupies a target."""
+        return np.zeros((len(arenas), self._num_robots), np.bool_)
 
 
 def decode_counters(images: UInt8Array) -> Counters:

@@ -21,9 +21,12 @@ from mrcdrl.common.runtime.completion import completed_by
 SEEDS = ("run.seed", "learner.seed", "replay.seed")  # of training
 _SHORT = {
     "arena.num_robots": "--robots",
+    "arena.env": "--env",
     "run.minutes": "--minutes",
     "run.learner_steps": "--learner-steps",
     "run.actors": "--actors",
+    "transport.metrics_port": "--metrics-port",
+    "transport.metrics_address": "--metrics-address",
 }
 _DEST = "config:"
 _HELP = ("-h", "--help")

@@ -1,5 +1,6 @@
 """How a configuration differs from another, and from the presets."""
 
+from functools import cache
 from typing import Any
 
 from mrcdrl.common.config.load import load_config, preset_names
@@ -28,9 +29,14 @@ def nearest_preset(config: Config) -> tuple[str, int]:
     counts = {
         name: sum(
             not (key.startswith(_OF_EVERY_RUN) or key.endswith(".seed"))
-            for key in differences(load_config(name, environ={}), config)
+            for key in differences(_preset(name), config)
         )
         for name in preset_names()
     }
     name = min(counts, key=lambda name: counts[name])
     return name, counts[name]
+
+
+@cache
+def _preset(name: str) -> Config:
+    return load_config(name, environ={})

@@ -2,18 +2,17 @@
 
 import math
 
-from mrcdrl.common.config.schema import AgentConfig, Config
+from mrcdrl.common.config.schema import Config
 
 _ON_TARGET = 1.0  # the most that a frame on a target brings, whatever arena.proximity_weight
 _COUNTED = 24.0  # the most that a frame of the counting arena brings
-_LARGEST_ENTROPY = math.log(3)  # of a policy over three actions
 
 
 def largest_return(config: Config) -> float:
     """A bound on the value of any state, in scaled rewards: all that an episode may bring."""
     agent = config.agent
     frames = min(config.arena.max_frames, 1 / (1 - agent.gamma))
-    return agent.reward_scale * _sum_of_rewards(config, frames) + frames * _log_policy(agent)
+    return agent.reward_scale * _sum_of_rewards(config, frames) + frames * _log_policy(config)
 
 
 def largest_n_step_return(config: Config) -> float:
@@ -24,6 +23,8 @@ def largest_n_step_return(config: Config) -> float:
 def _sum_of_rewards(config: Config, frames: float) -> float:
     """A bound on the absolute sum of a robot's rewards over so many frames of an episode."""
     arena, agent = config.arena, config.agent
+    if arena.is_custom:
+        return frames * arena.largest_reward
     usual = _COUNTED if arena.kind == "counting" else max(abs(arena.step_reward), _ON_TARGET)
     collisions = min(arena.max_collisions, frames)
     price = abs(arena.collision_reward) * max(factor for _, factor in agent.collision_schedule)
@@ -33,9 +34,10 @@ def _sum_of_rewards(config: Config, frames: float) -> float:
     return abs(arena.success_reward) + collisions * price + frames * usual + potential
 
 
-def _log_policy(agent: AgentConfig) -> float:
+def _log_policy(config: Config) -> float:
     """A bound on what the log-policy adds to a frame, in scaled rewards."""
+    agent = config.agent
     if not agent.munchausen_alpha:
         return 0.0
-    entropy = agent.munchausen_temperature * _LARGEST_ENTROPY
+    entropy = agent.munchausen_temperature * math.log(max(2, config.arena.action_count))
     return agent.munchausen_alpha * agent.munchausen_clip + entropy

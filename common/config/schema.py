@@ -4,6 +4,7 @@ A default is the paper's where the paper gives one ("paper"), that of the game i
 where that settles it ("ancestor"), and ours otherwise ("ours").
 """
 
+import ipaddress
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ _FINEST_PX = 2.5  # arena px per image px; below, the literal renderer draws
 _LONGEST_S = 1e9  # thirty years; the system's waits overflow beyond nine times that
 LARGEST = 2**63 - 1  # whole number that TOML, torch and the wire all take
 MOST_ROBOTS = 10
+MOST_ACTIONS = 64
+_WORLD = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # package.module:make
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -66,9 +69,17 @@ class ArenaConfig(Section):
     """The 2-D world, its rewards and its images (paper sections 3 and 4)."""
 
     kept: ClassVar[bool] = True
-    kind: Literal["robots", "counting"] = "robots"
+    kind: Literal["robots", "counting", "custom"] = "robots"
     """`robots`: the paper's arena. `counting`: images that encode actor, episode and step, for
-    tests of the data path. (ours)"""
+    tests of the data path. `custom`: the world that env names, which sets this. (ours)"""
+    env: str = ""
+    """A world of your own, package.module:make, where make() returns a PettingZoo ParallelEnv or a
+    Gymnasium environment; empty: the paper's arena. (ours)"""
+    num_actions: Annotated[int, Field(ge=0, le=MOST_ACTIONS)] = 0
+    """Actions of a custom world; 0: found out from the world, with num_robots, before a run starts.
+    (ours)"""
+    largest_reward: Annotated[float, Field(gt=0, le=1e6)] = 100.0
+    """Greatest absolute reward of a custom world's step; a greater one ends the run. (ours)"""
     physics: Literal["array", "pymunk"] = "array"
     """Physics engine: compiled arrays, or pymunk, the reference; both give the same poses.
     (ours; ancestor: pymunk)"""
@@ -179,6 +190,16 @@ class ArenaConfig(Section):
         return len(self.obstacles_px) + self.num_obstacles
 
     @property
+    def is_custom(self) -> bool:
+        """Whether this is a world that somebody else wrote."""
+        return self.kind == "custom"
+
+    @property
+    def action_count(self) -> int:
+        """Number of actions; 0 for a custom world that nobody has asked yet."""
+        return self.num_actions if self.is_custom else 3  # left, straight, right
+
+    @property
     def renders_analytically(self) -> bool:
         """Whether images are computed from the poses."""
         return self.renderer == "analytic" and self.crop_px >= _FINEST_PX * self.view_px
@@ -200,9 +221,25 @@ class ArenaConfig(Section):
             return {**given, "num_robots": robots[-1]}
         return given
 
+    @model_validator(mode="before")
+    @classmethod
+    def _derive_custom(cls, given: Any) -> Any:
+        """Let env alone decide on a custom world, where kind and codec are not given."""
+        if isinstance(given, dict) and given.get("env"):
+            return {"kind": "custom", "codec": "frames", **given}
+        return given
+
+    @field_validator("env")
+    @classmethod
+    def _check_env(cls, value: str) -> str:
+        if value and not _WORLD.fullmatch(value):
+            raise ValueError("name a module and what makes the world in it: package.module:make")
+        return value
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         self._check_robots()
+        self._check_custom()
         inner = self.size_px - 2 * (self.wall_offset_px + self.wall_thickness_px)
         if inner < 2 * self.robot_radius_px:
             raise ValueError(
@@ -241,6 +278,20 @@ class ArenaConfig(Section):
             )
         return self
 
+    def _check_custom(self) -> None:
+        """Raise ValueError if settings of a custom world are missing, or given without one."""
+        if self.is_custom != bool(self.env):
+            raise ValueError(
+                f'kind = "{self.kind}" with env "{self.env}": a custom world needs env, such as '
+                '"package.module:make", and kind = "custom", which follows from it'
+            )
+        if self.is_custom and self.codec != "frames":
+            raise ValueError('a custom world has no scene to send: set codec = "frames"')
+        if self.num_actions and not self.is_custom:
+            raise ValueError(f"num_actions {self.num_actions} is of a custom world: give env too")
+        if self.num_actions == 1:
+            raise ValueError("num_actions 1 leaves nothing to choose")
+
     def _check_robots(self) -> None:
         """Raise ValueError if robots and the settings that depend on it do not fit."""
         numbers = self.numbers
@@ -251,8 +302,8 @@ class ArenaConfig(Section):
                 f"num_robots {self.num_robots} is not the last of robots {list(numbers)}; give one "
                 "of the two"
             )
-        if self.mixes_numbers and self.kind == "counting":
-            raise ValueError('kind = "counting" needs a fixed number of robots, num_robots')
+        if self.mixes_numbers and self.kind != "robots":
+            raise ValueError(f'kind = "{self.kind}" needs a fixed number of robots, num_robots')
         if self.mixes_numbers and self.targets_px and not self.num_targets:
             raise ValueError(
                 f"targets_px has the same {len(self.targets_px)} targets for each of robots "
@@ -270,6 +321,10 @@ class AgentConfig(Section):
     """Discount of rewards for each step that they are away. (paper)"""
     n_step: Annotated[int, Field(ge=1, le=32), Kept()] = 1
     """Rewards summed before the bootstrap. (paper: 1; Ape-X: 3)"""
+    symmetric_views: Annotated[int, Field(ge=1, le=8)] = 1
+    """Evaluators, `mrcdrl evaluate` and robots act by the mean of the values of up to so many views
+    of a state, mapped by symmetries of the layout. A network has not quite learned that these are
+    alike. Each view costs an inference. Actors act by one. (paper: 1)"""
     shaping_per_px: Annotated[float, Field(ge=0, le=1000), Kept()] = 0.0
     """Potential that a robot loses with each px between it and its target, by the assignment with
     the least sum of distances. Learned from are then rewards with gamma Phi(s') - Phi(s) added;
@@ -280,6 +335,9 @@ class AgentConfig(Section):
     collision_schedule: Annotated[Schedule, Kept()] = ((0, 1.0),)
     """Points (learner step of the weights that act, factor 0 to 100 of arena.collision_reward in
     the rewards learned from), linear between, constant after the last. (ours)"""
+    occupied_targets_pay: Annotated[bool, Kept()] = True
+    """Whether a robot also learns from what it is paid on a target that another robot is nearer to;
+    without, such a frame counts as one off target. (paper: true)"""
     reward_scale: Annotated[Positive, Kept()] = 1.0
     """Factor on the rewards in the learner's target. (ours)"""
     loss: Literal["squared", "huber"] = "squared"
@@ -361,6 +419,8 @@ class CurriculumConfig(Section):
     schedule: tuple[tuple[float, ...], ...] = ()
     """Points [learner step, a weight for each of arena.robots], linear between, constant after the
     last, such as [[0, 1, 0], [5000, 1, 3]]; empty: equal weights. (ours)"""
+    greatest_first_steps: Annotated[int, Field(ge=0)] = 0
+    """Learner steps in which only the greatest number is played, before `kind` decides. (ours)"""
     floor: Fraction = 0.2
     """Part of the transitions that `automatic` spreads evenly over all numbers. (ours)"""
     memory_episodes: Count = 50
@@ -493,6 +553,9 @@ class LearnerConfig(Section):
     publish_interval_s: Pause = 0.2
     """Least time between publications: a fast learner skips some, which leaves their readers time
     to adopt them. Not with run.turn_size. (ours)"""
+    publish_bytes_per_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3e8
+    """Bytes of weights a second to all actors and evaluators together: the more of them there are,
+    the less often weights are published. 0: no limit. Not with run.turn_size. (ours)"""
     publish_precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Precision of published weights: half precision halves their bytes, and readers cast up. The
     best weights are kept as evaluated. (ours)"""
@@ -522,6 +585,9 @@ class EvaluatorConfig(Section):
 
     episodes: Count = 100
     """Episodes of each evaluation; the paper's table has 1100. (ours)"""
+    probe_episodes: Annotated[int, Field(ge=0)] = 20
+    """Episodes after which an evaluation without a success ends: a policy that has learned nothing
+    plays each to the time limit; 0: all are always played. (ours)"""
     epsilon: Fraction = 0.01
     """Probability of a random action in the test. (paper)"""
     period_s: Pause = 30.0
@@ -555,6 +621,11 @@ class RunConfig(Section):
     """Ends the run at this learner step; 0: never. (ours)"""
     target_success_rate: Fraction = 0
     """Ends the run at the first evaluation that reaches this rate; 0: never. (ours)"""
+    tracker: Literal["none", "trackio", "wandb"] = "none"
+    """Experiment tracker that the recorder hands the run's figures to, in a process of its own; its
+    package is an extra, and its own variables say where they go. (ours)"""
+    tracker_project: str = "mrcdrl"
+    """Name of the project there. (ours)"""
     patience_episodes: Annotated[int, Field(ge=0)] = 1000
     """The paper's stopping rule (section 5.2): ends the run when the successes in 100 episodes
     reach no new maximum for this many episodes; 0: never. (paper)"""
@@ -564,7 +635,7 @@ class RunConfig(Section):
 
 
 class TransportConfig(Section):
-    """Connections over Zenoh."""
+    """Connections of one process: over Zenoh, and for Prometheus."""
 
     connect: tuple[str, ...] = ()
     """Endpoints to connect to, such as tcp/127.0.0.1:7447. (ours)"""
@@ -581,9 +652,28 @@ class TransportConfig(Section):
     """Deadline of one query. (ours)"""
     max_message_bytes: Count = 64 << 20
     """Largest message; larger ones are refused. (ours)"""
+    max_peers: Count = 2000
+    """Connections that a process which listens admits at once, and as many more that are still
+    joining: one for each actor, evaluator and watcher, two for the learner. (ours)"""
     shared_memory: bool = True
     """Send large messages between processes of one host through shared memory, where both can
     reach it; over the network otherwise. (ours)"""
+    metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Port on which this process serves its metrics to Prometheus; 0: none. `mrcdrl train` and
+    `mrcdrl status` serve those of the whole run. (ours; usual: 9464)"""
+    metrics_address: str = "127.0.0.1"
+    """IP address on which it does so; 0.0.0.0 is all of this machine's. (ours)"""
+
+    @field_validator("metrics_address")
+    @classmethod
+    def _check_address(cls, value: str) -> str:
+        try:
+            ipaddress.ip_address(value)
+        except ValueError:
+            raise ValueError(
+                f"{value!r} is not an IP address; give one, such as 127.0.0.1 or 0.0.0.0"
+            ) from None
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -626,9 +716,23 @@ class Config(Section):
                 "curriculum.schedule needs points of a learner step and a weight for each of "
                 f"arena.robots {list(numbers)}"
             )
+        if self.arena.is_custom:
+            self._check_custom()
         if self.run.turn_size:
             self._check_lockstep()
         return self
+
+    def _check_custom(self) -> None:
+        """Raise ValueError for rewards that need the paper's arena: poses, targets, collisions."""
+        agent = self.agent
+        needing = {
+            "agent.shaping_per_px": agent.shaping_per_px > 0,
+            "agent.collision_schedule": any(factor != 1 for _, factor in agent.collision_schedule),
+            "agent.occupied_targets_pay": not agent.occupied_targets_pay,
+        }
+        for name, given in needing.items():
+            if given:
+                raise ValueError(f"{name} needs the paper's arena: leave it out with arena.env")
 
     def _check_lockstep(self) -> None:
         """Raise ValueError if turns of this size are impossible, or not repeatable."""

@@ -5,16 +5,19 @@ a process of ours sends is refused. What has passed needs no guard behind `decod
 """
 
 import math
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.config.schema import MOST_ACTIONS
 from mrcdrl.common.messages.metrics import SCHEMAS, DiagnosticMetrics, kinds
 from mrcdrl.common.messages.trajectory import (
     NO_SLOT,
     NUM_ACTIONS,
+    ArenaFrame,
     Chunk,
     EpisodeSummary,
     Evaluation,
@@ -22,6 +25,7 @@ from mrcdrl.common.messages.trajectory import (
     InsertReply,
     LeaseReply,
     LeaseRequest,
+    Outcome,
     Priorities,
     PrioritiesReply,
     SampleRequest,
@@ -35,10 +39,12 @@ from mrcdrl.common.runtime.names import MAX_NAME, is_name, printable
 Range = tuple[float, float]
 
 MAX_REPORT_BYTES = 1 << 16  # of Stats, EpisodeSummary and Evaluation: twice what the rest allows
+MAX_FRAME_BYTES = 1 << 18  # of an ArenaFrame
 MAX_METRICS = 256  # of one service
 MAX_TEXTS = 32
 MAX_TEXT = 256  # characters
 _MOST = 2**53  # the largest count that a float64 holds exactly
+_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 _RATES_SUM = 1e-3  # rates rounded by a sender may miss 1 by this
 _COUNT: Range = (0, _MOST)
 _NUMBER: Range = (-_MOST, _MOST)
@@ -52,6 +58,8 @@ def _range_of_num_robots() -> Range:
     schema = ArenaConfig.model_json_schema()["properties"]["num_robots"]
     return schema["minimum"], schema["maximum"]
 
+
+_NUM_ROBOTS = _range_of_num_robots()  # made once: a schema takes milliseconds
 
 RANGES: dict[type, dict[str, Range]] = {
     InsertReply: {"sequence": _TIME_NS, "inserts": _COUNT},
@@ -67,12 +75,13 @@ RANGES: dict[type, dict[str, Range]] = {
         "collisions": _COUNT,
         "epsilon": _FRACTION,
         "weights_version": _COUNT,
+        "num_robots": _NUM_ROBOTS,
     },
     Evaluation: {
         "weights_epoch": _TIME_NS,
         "weights_version": _COUNT,
         "learner_step": _COUNT,
-        "num_robots": _range_of_num_robots(),
+        "num_robots": _NUM_ROBOTS,
         "episodes": (1, _MOST),
         "success_rate": _FRACTION,
         "collision_rate": _FRACTION,
@@ -84,6 +93,14 @@ RANGES: dict[type, dict[str, Range]] = {
         "mean_score": _NUMBER,
         "wall_s": _COUNT,
     },
+    ArenaFrame: {
+        "arena": _COUNT,
+        "episode": _COUNT,
+        "frame": _COUNT,
+        "weights_version": (-1, _MOST),
+        "epsilon": _FRACTION,
+        "view_px": (1, 1024),
+    },
 }
 """The least and the greatest value of a message's fields; NaN is in no range."""
 
@@ -93,6 +110,7 @@ SENDERS: dict[type, tuple[str, ...]] = {
     EpisodeSummary: ("actor",),
     Evaluation: ("worker",),
     Stats: ("role", "id"),
+    ArenaFrame: ("role", "worker"),
 }
 """The fields that name who sent a message; a publication's key ends with them."""
 
@@ -156,8 +174,8 @@ def _check_transitions(message: Chunk | Samples) -> str | None:
         return "a reward is not finite"
     if not ((discounts >= 0).all() and (discounts <= 1).all()):
         return "a discount is outside 0 ... 1, or not finite"
-    if (message.actions >= NUM_ACTIONS).any():
-        return f"an action is not below {NUM_ACTIONS}"
+    if (message.actions >= MOST_ACTIONS).any():
+        return f"an action is not below {MOST_ACTIONS}"
     if (message.bootstrap_offsets < 1).any():
         return "a bootstrap offset is 0"
     return None
@@ -219,6 +237,38 @@ def _check_stats(stats: Stats) -> str | None:
     return _check_metrics(_KINDS.get(stats.role, {}), stats.metrics)
 
 
+def _check_arena_frame(frame: ArenaFrame) -> str | None:
+    rows = {"robots": 3, "targets": 2, "obstacles": 3}
+    for name, width in rows.items():
+        array = getattr(frame, name)
+        if array.ndim != 2 or array.shape[1] != width or not np.isfinite(array).all():
+            return f"{name} is not a matrix of {width} columns, or not finite"
+    num_robots, num_acting = len(frame.robots), len(frame.actions)
+    if not 1 <= num_robots <= _NUM_ROBOTS[1]:
+        return f"{num_robots} robots"
+    if num_acting not in (0, num_robots) or frame.actions.ndim != 1:
+        return "actions is neither empty nor one for each robot"
+    if frame.q_values.shape != (num_acting, NUM_ACTIONS) or (frame.actions >= NUM_ACTIONS).any():
+        return f"q_values has not {NUM_ACTIONS} values for each action, or an action is none"
+    if frame.collided.shape != (num_robots,):
+        return "collided is not one for each robot"
+    if frame.outcome and frame.outcome not in set(Outcome):
+        return "outcome is none"
+    if frame.images and not _inflates_to(frame.images, num_robots * frame.view_px**2):
+        return "images is not zlib data of one image for each robot"
+    return None
+
+
+def _inflates_to(packed: bytes, size: int) -> bool:
+    """Whether zlib data is whole and holds so many bytes; no more are unpacked."""
+    unpacking = zlib.decompressobj()
+    try:
+        unpacked = unpacking.decompress(packed, size + 1)
+    except zlib.error:
+        return False
+    return len(unpacked) == size and unpacking.eof
+
+
 def _no_name(names: Iterable[str]) -> str:
     return next((name or "(empty)" for name in names if not is_name(name)), "")
 
@@ -226,7 +276,7 @@ def _no_name(names: Iterable[str]) -> str:
 def _check_metrics(known: Mapping[str, str], metrics: Mapping[str, float]) -> str | None:
     """Check metrics by their kinds; one that is not known is a gauge."""
     for name, value in metrics.items():
-        if name in _MAY_DIVERGE:
+        if name in _MAY_DIVERGE and not _LARGEST_FLOAT32 < abs(value) < math.inf:
             continue
         low, high = _NUMBER_OF_KIND[known.get(name, "gauge")]
         if not low <= value <= high:
@@ -255,4 +305,5 @@ _CHECKS: dict[type, Callable[[Any], str | None]] = {
     Weights: _check_weights,
     Evaluation: _check_evaluation,
     Stats: _check_stats,
+    ArenaFrame: _check_arena_frame,
 }

@@ -17,6 +17,7 @@ class Fitting:
     def __init__(self, config: Config) -> None:
         window = config.arena.stack + config.agent.n_step
         self._shape = (config.learner.batch_size, window, config.arena.record_bytes)
+        self._num_actions = config.arena.action_count
         self._n_step = config.agent.n_step
         self._largest_return = largest_n_step_return(config)
 
@@ -27,7 +28,16 @@ class Fitting:
                 f"records {list(samples.records.shape)} where {list(self._shape)} are due: "
                 "another run?"
             )
+        check_actions(samples, self._num_actions)
         check_returns(samples, self._n_step, self._largest_return)
+
+
+def check_actions(transitions: Samples | Chunk, num_actions: int) -> None:
+    """Raise WireError for an action that the run's arena does not have."""
+    if int(transitions.actions.max()) >= num_actions:
+        raise WireError(
+            f"action {transitions.actions.max()} where the arena of this run has {num_actions}"
+        )
 
 
 def check_returns(transitions: Samples | Chunk, n_step: int, largest_return: float) -> None:

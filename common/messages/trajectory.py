@@ -24,7 +24,7 @@ Float64Array = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
 Int64Array = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
-NUM_ACTIONS = 3  # left, straight, right (paper section 3)
+NUM_ACTIONS = 3  # left, straight, right (paper section 3); a custom world has its own number
 NO_SLOT = -1  # an actor without an exploration slot
 DOING = "doing"  # a text in Stats: what keeps a service from its work
 COMPILING = "compiling"  # its functions, once
@@ -39,7 +39,7 @@ class StepType(IntEnum):
 
 
 class Outcome(StrEnum):
-    """How an episode ended."""
+    """How an episode ended; a custom world's failures of any kind count as collisions."""
 
     SUCCESS = "success"
     COLLISION = "collision"
@@ -230,6 +230,7 @@ class EpisodeSummary:
     epsilon: float
     weights_version: int
     mean_q: float  # value of the greedy action, mean over the episode (Fig. 7a-c)
+    num_robots: int  # of the episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,6 +254,32 @@ class Evaluation:
     mean_score: float
     seed: int
     wall_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ArenaFrame:
+    """One frame of an episode, for people to watch; K, M and O count what is there.
+
+    The values, actions and images are those of the robots in this scene. The last frame of an
+    episode has an outcome, and neither values nor actions.
+    """
+
+    role: str
+    worker: str
+    arena: int  # index among the worker's arenas
+    episode: int  # counter of what this worker has shown
+    frame: int  # 0 at the start
+    weights_version: int  # that chose the actions; -1: initial parameters
+    epsilon: float
+    robots: Float32Array  # [K, 3], x px, y px, heading rad
+    targets: Float32Array  # [M, 2], x px, y px
+    obstacles: Float32Array  # [O, 3], x px, y px, radius px
+    q_values: Float32Array  # [K, NUM_ACTIONS], or [0, NUM_ACTIONS]
+    actions: UInt8Array  # [K], or [0]
+    collided: UInt8Array  # [K], 1 if the move to this frame was undone
+    outcome: str  # in the last frame, else empty
+    view_px: int  # V
+    images: bytes  # the robots' newest images, uint8 [K, V, V], as zlib data; or none
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.checks import SENDERS, problem
 from mrcdrl.common.messages.framing import Part, join_map, padded, split_map
 from mrcdrl.common.messages.trajectory import (
+    ArenaFrame,
     Chunk,
     EpisodeSummary,
     Evaluation,
@@ -41,6 +42,7 @@ from mrcdrl.common.runtime.names import printable
 M = TypeVar("M")
 _MAX_NDIM = 8
 _LARGE_BYTES = 8192  # arrays of this size or more follow the map
+_HEAD = 256  # bytes of encoded weights, in which all but the payload begins
 
 _SCHEMAS: dict[type, str] = {
     Chunk: "chunk/1",
@@ -52,9 +54,10 @@ _SCHEMAS: dict[type, str] = {
     LeaseRequest: "lease_request/1",
     LeaseReply: "lease_reply/1",
     Weights: "weights/2",
-    EpisodeSummary: "episode/1",
+    EpisodeSummary: "episode/2",
     Evaluation: "evaluation/1",
     Stats: "stats/1",
+    ArenaFrame: "arena_frame/1",
 }
 
 
@@ -80,6 +83,16 @@ def encode_parts(message: Any) -> list[Part]:
                 place += padded(little.nbytes)
         table[field.name] = value
     return join_map(msgpack.packb(table), large)
+
+
+def learner_step_of(weights: bytes) -> int:
+    """The learner step of encoded weights, whose payload is left alone; raises WireError."""
+    try:
+        unpacker = msgpack.Unpacker()
+        unpacker.feed(weights[:_HEAD].partition(b"learner_step")[2])
+        return int(unpacker.unpack())
+    except (ValueError, msgpack.exceptions.UnpackException) as error:
+        raise WireError("these are no weights") from error
 
 
 def decode(cls: type[M], data: Part) -> M:

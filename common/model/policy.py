@@ -6,17 +6,23 @@ chosen by; weights change in `adopt` only, wholly or not at all.
 Shapes: N = robots acted for at once, S = images stacked, V = width of an image in px.
 """
 
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mrcdrl.common.arena import IDENTITY, Symmetry, layout_symmetries
 from mrcdrl.common.config import Config
-from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array, Weights
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float32Array, UInt8Array, Weights
 from mrcdrl.common.model.fast_forward import fast_forward, operands, prepare
 from mrcdrl.common.model.q_network import QNetwork, precision
 from mrcdrl.common.model.weights_io import load_weights
+
+_ACTIONS = np.arange(NUM_ACTIONS, dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +42,9 @@ class Selection:
 class Policy:
     """Epsilon-greedy on a network's values (paper section 5.2)."""
 
-    def __init__(self, network: QNetwork) -> None:
+    def __init__(self, network: QNetwork, symmetries: Sequence[Symmetry] = (IDENTITY,)) -> None:
+        """symmetries: values are means over what the network says of the states mapped by each."""
+        self._symmetries = tuple(symmetries)
         self.network = network.eval().requires_grad_(requires_grad=False)
         self._device = next(network.parameters()).device
         self._operands = operands(network)
@@ -49,6 +57,15 @@ class Policy:
             f"Policy(kind={self.network.kind!r}, weights_epoch={self.weights_epoch}, "
             f"weights_version={self.weights_version}, learner_step={self.learner_step})"
         )
+
+    def averaging(self, symmetries: Sequence[Symmetry]) -> Self:
+        """The policy with the same network, and these symmetries in place of its own.
+
+        They share parameters, so neither is to adopt others.
+        """
+        other = copy.copy(self)
+        other._symmetries = tuple(symmetries)
+        return other
 
     def adopt(self, weights: Weights) -> None:
         """Act by these weights from now on.
@@ -63,6 +80,16 @@ class Policy:
 
     def q_values(self, observations: UInt8Array) -> Float32Array:
         """Values float32 [N, num_actions] of states uint8 [N, S, V, V]."""
+        if self._symmetries == (IDENTITY,):
+            return self._inferred(observations)
+        total = np.zeros((len(observations), NUM_ACTIONS), np.float32)
+        for symmetry in self._symmetries:
+            values = self._inferred(symmetry.apply_to_images(observations))
+            total += values[:, symmetry.apply_to_actions(_ACTIONS)]
+        return total / np.float32(len(self._symmetries))
+
+    def _inferred(self, observations: UInt8Array) -> Float32Array:
+        """The network's values of the states as they are."""
         states = torch.from_numpy(np.require(observations, requirements=["C", "W"]))
         with torch.inference_mode():
             prepared = prepare(self.network, states.to(self._device))
@@ -85,15 +112,26 @@ class Policy:
         return Selection(actions=actions, q_values=values, greedy_q=values.max(axis=1))
 
 
-def make_policy(config: Config, device: str | torch.device = "cpu") -> Policy:
-    """A policy of the configured network on a device, its parameters still to be adopted."""
+def averaged_symmetries(config: Config) -> tuple[Symmetry, ...]:
+    """The symmetries over which whoever judges or uses weights of a run averages their values."""
+    return layout_symmetries(config.arena)[: config.agent.symmetric_views]
+
+
+def make_policy(
+    config: Config, device: str | torch.device = "cpu", *, averages: bool = True
+) -> Policy:
+    """A policy of the configured network on a device, its parameters still to be adopted.
+
+    averages: over symmetries, if the configuration says so.
+    """
     network = QNetwork(
         config.agent.kind,
         stack=config.arena.stack,
         view_px=config.arena.view_px,
+        num_actions=config.arena.action_count,
         compute_dtype=precision(config.learner.precision, device),
     )
-    return Policy(network.to(device))
+    return Policy(network.to(device), averaged_symmetries(config) if averages else (IDENTITY,))
 
 
 class FrameStack:

@@ -10,7 +10,7 @@ from pathlib import Path
 from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import Weights
-from mrcdrl.common.model.policy import Policy
+from mrcdrl.common.model.policy import Policy, averaged_symmetries
 from mrcdrl.common.model.q_network import precision
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import network_from_bytes
@@ -90,6 +90,11 @@ def policy_of(path: Path, weights: Weights, config: Config) -> Policy:
             f"{path} sees {network.stack} images of {network.view_px} px, the arena gives "
             f"{arena.stack} of {arena.view_px} px"
         )
-    policy = Policy(network)
+    if network.num_actions != arena.action_count:
+        raise CheckpointError(
+            f"{path} chooses among {network.num_actions} actions, the arena has "
+            f"{arena.action_count}"
+        )
+    policy = Policy(network, averaged_symmetries(config))
     policy.adopt(weights)
     return policy

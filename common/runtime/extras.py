@@ -9,13 +9,16 @@ from mrcdrl.common.errors import ConfigError
 PACKAGES = {  # as they are imported, by the extra that installs them
     "arena": ("numba", "cv2", "pymunk", "scipy"),
     "learn": ("torch", "safetensors", "numba"),
-    "report": ("matplotlib", "av", "tensorboardX"),
+    "report": ("matplotlib", "av", "markdown_it", "tensorboardX"),
     "env": ("pettingzoo", "gymnasium"),
     "certs": ("cryptography",),
     "export": ("onnx", "onnxscript", "onnxruntime"),
     "rerun": ("rerun",),
+    "web": ("starlette", "uvicorn", "sse_starlette"),
+    "trackio": ("trackio",),
+    "wandb": ("wandb",),
 }
-TRAINING = ("arena", "learn", "report")  # the extras that `all` stands for
+TRAINING = ("arena", "learn", "report", "web")  # the extras that `all` stands for
 
 
 @contextmanager

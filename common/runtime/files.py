@@ -17,6 +17,9 @@ TEMPORARY_SUFFIX = ".part"
 WEIGHTS_SUFFIX = ".safetensors"
 RUN_CONFIG = "config.toml"  # in a run directory, as all below
 METRICS = "metrics.jsonl"
+PICTURES = ("training.png", "trajectories.png")
+MOVING_PICTURE = "evaluation.gif"
+FILM = "evaluation.mp4"
 BEST_WEIGHTS = Path("checkpoints") / f"best{WEIGHTS_SUFFIX}"
 CHECKPOINT_MANIFEST = "manifest.json"
 

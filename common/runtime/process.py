@@ -173,6 +173,16 @@ def start_service(
         )
 
 
+def end_service(process: "subprocess.Popen[bytes]", patience_s: float) -> None:
+    """Ask a service to end, wait, and kill it if that takes longer; harmless if it has ended."""
+    process.terminate()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
 def last_line(log: Path, begin: int = 0) -> str:
     """The last line of a log from this byte on, usually the reason why its service ended."""
     try:

@@ -17,6 +17,7 @@ from mrcdrl.common.config import (
     from_toml,
     load_transport,
     validate_config,
+    variable,
 )
 from mrcdrl.common.config.arguments import (
     SEEDS,
@@ -33,6 +34,7 @@ from mrcdrl.common.errors import (
     WireError,
 )
 from mrcdrl.common.runtime.names import check_name, printable
+from mrcdrl.common.runtime.pauses import random_pauses
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.runs import add_run, is_run, run_path, unknown_run
 from mrcdrl.common.transport import Session
@@ -141,27 +143,51 @@ def recorded_endpoint(run_dir: Path, flag: str) -> str:
 
 
 def fetch_config(
-    session: Session, joining: Joining, stop: StopSignal, timeout_s: float = 30.0
+    session: Session,
+    joining: Joining,
+    stop: StopSignal,
+    timeout_s: float = 30.0,
+    *,
+    plays: bool = False,
 ) -> Config:
     """Ask replay for the run's configuration, and put this process's own settings over it.
+
+    plays: this process makes the run's arenas. It imports a custom world only if it was itself told
+    to: what is served over the network does not decide which code runs here. Else ConfigError.
 
     Raises, once the time is over, DeadlineError if nobody serves that run, WireError or
     RefusedError if the answer is not a configuration: another process may have answered.
     """
     whom = f"the replay service of run {joining.run!r}"
     client = session.client(joining.keys.config, whom, timeout_s=2.0)
-    deadline = time.monotonic() + timeout_s
+    deadline, pauses = time.monotonic() + timeout_s, random_pauses()
     while True:
         try:
             served = _served(bytes(client.ask(b"").result()), whom)
         except (DeadlineError, RefusedError, WireError) as error:
-            if time.monotonic() > deadline or stop.wait(0.2):
+            left_s = deadline - time.monotonic()
+            if left_s < 0 or stop.wait(min(next(pauses), left_s)):
                 if isinstance(error, DeadlineError):
                     raise DeadlineError(f"{error}; is that the run's name?") from error
                 raise
             continue
+        if plays:
+            _check_world(served.get("arena", {}).get("env", ""), joining)
         table = {**served, "transport": joining.transport.model_dump()}
         return apply_overrides(table, joining.overrides)
+
+
+def _check_world(served: str, joining: Joining) -> None:
+    """Raise ConfigError unless this process was told to play in the run's world."""
+    name = variable("arena", "env")
+    own = joining.overrides.get("arena.env", os.environ.get(name, ""))
+    if own != served:
+        told = f"this process was told {own}" if own else "this process was not told to import it"
+        world = served or "the paper's arena"
+        raise ConfigError(
+            f"run {joining.run} plays in {world}, and {told}: give "
+            f"{f'--env {served}' if served else 'no --env'}, or set {name}"
+        )
 
 
 def _served(answer: bytes, whom: str) -> dict[str, Any]:

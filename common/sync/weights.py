@@ -18,7 +18,7 @@ from mrcdrl.common.messages.trajectory import Weights
 from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.repeats import is_logged
-from mrcdrl.common.transport import PendingReply, Session
+from mrcdrl.common.transport import PendingReply, Priority, Session
 from mrcdrl.common.transport.keys import Keys
 
 _LOG = logging.getLogger("weights")
@@ -26,17 +26,24 @@ _POLL_S = 0.2
 _RETRY_S = 0.5
 _SILENCE_S = 20.0
 _AFTER_REFUSAL_S = 1.0
+_COUNT_S = 5.0  # for which a count of the readers holds
+_READERS = ("actor", "evaluator")  # roles
 
 
 class WeightsWriter:
     """Publishes weights and answers late joiners with the newest, in two threads of its own.
 
     A subscriber that hangs blocks the publishing thread only, which then skips versions that have
-    become old.
+    become old. So it does while bytes_per_s, of all actors and evaluators together, are spent by
+    the publication before; 0: there is no limit.
     """
 
-    def __init__(self, session: Session, keys: Keys) -> None:
-        self._publisher = session.publisher(keys.weights)
+    def __init__(self, session: Session, keys: Keys, bytes_per_s: float = 0.0) -> None:
+        self._session, self._keys, self._bytes_per_s = session, keys, bytes_per_s
+        self._readers, self._count_at_s = 0, 0.0
+        self.publications = 0
+        """Published so far; those that were skipped do not count."""
+        self._publisher = session.publisher(keys.weights, Priority.LOW)
         self._server = session.server(keys.weights)
         self._changed = threading.Condition()
         self._newest: bytes | None = None
@@ -74,10 +81,32 @@ class WeightsWriter:
                 if payload is None or payload is self._published:
                     return
                 self._published = payload
+            began_s = time.monotonic()
             try:
                 self._publisher.put(payload)
+                self.publications += 1
             except TransportError as error:
                 _LOG.warning("weights not published: %s", error)
+            self._rest(began_s, len(payload))
+
+    def _rest(self, began_s: float, size: int) -> None:
+        """Wait until the bytes of a publication are spent, or for `close`."""
+        if not self._bytes_per_s:
+            return
+        end_s = began_s + self._num_readers() * size / self._bytes_per_s
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopping, max(end_s - time.monotonic(), 0.0))
+
+    def _num_readers(self) -> int:
+        """How many actors and evaluators there are, or were when that could be found out."""
+        now_s = time.monotonic()
+        if now_s >= self._count_at_s:
+            self._count_at_s = now_s + _COUNT_S
+            with contextlib.suppress(TransportError):
+                self._readers = sum(
+                    len(self._session.tokens(self._keys.claim(role, "*", "*"))) for role in _READERS
+                )
+        return self._readers
 
     def _serve(self) -> None:
         while not self._stopping:
@@ -108,7 +137,9 @@ class WeightsReader:
         silence_s: float = _SILENCE_S,
     ) -> None:
         self._subscriber = session.latest_subscriber(keys.weights)
-        self._client = session.client(keys.weights, "the learner", timeout_s=2.0)
+        self._client = session.client(
+            keys.weights, "the learner", timeout_s=2.0, priority=Priority.LOW
+        )
         self._adopt = adopt
         self._silence_s = silence_s
         self._ask_at_s = time.monotonic() + silence_s

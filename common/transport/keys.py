@@ -9,6 +9,7 @@ mrcdrl/<run>/weights                   publication and query: Weights
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
 mrcdrl/<run>/stats/<role>/<worker>     publication: Stats
+mrcdrl/<run>/arena/<role>/<worker>     publication: ArenaFrame
 mrcdrl/<run>/live/<role>/<worker>      liveliness token
 mrcdrl/<run>/claim/<role>/<name>/<ns>  liveliness token
 """
@@ -56,6 +57,9 @@ class Keys:
 
     def stats(self, role: str, worker: str) -> str:
         return f"mrcdrl/{self.run}/stats/{role}/{worker}"
+
+    def arena(self, role: str, worker: str) -> str:
+        return f"mrcdrl/{self.run}/arena/{role}/{worker}"
 
     def live(self, role: str, worker: str) -> str:
         return f"mrcdrl/{self.run}/live/{role}/{worker}"

@@ -37,6 +37,20 @@ class Publisher:
             raise TransportError(f"cannot publish: {error}") from error
 
 
+class WatchedPublisher(Publisher):
+    """A publisher that knows whether anybody listens, at the cost of reading a flag.
+
+    What the link has no room for is dropped.
+    """
+
+    watched = False
+    listener: Any = None  # Zenoh's, which tells `observe` while it is held
+
+    def observe(self, status: Any) -> None:
+        """Zenoh's callback."""
+        self.watched = bool(status.matching)
+
+
 class LatestSubscriber:
     """The newest publication, for one reading thread."""
 

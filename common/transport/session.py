@@ -1,8 +1,9 @@
 """One Zenoh session and what it declares; every wait has a deadline, every queue a limit.
 
 Invariants: Zenoh's callbacks only enqueue; the one thread here, `renew`, belongs to the session
-and is joined by `close`; Zenoh's errors become ours at this boundary; leaving the `with` block
-closes the session and everything it declared.
+and is joined by `close`; attempts to join are repeated at random times, so that many processes
+that lost one router do not come back at once; Zenoh's errors become ours at this boundary; leaving
+the `with` block closes the session and everything it declared.
 """
 
 import contextlib
@@ -30,31 +31,43 @@ from mrcdrl.common.errors import (
     UnreachableError,
 )
 from mrcdrl.common.runtime.closing import Closing
+from mrcdrl.common.runtime.open_files import allow_open_files
+from mrcdrl.common.runtime.pauses import random_pauses
+from mrcdrl.common.transport.places import Places
+from mrcdrl.common.transport.priority import Priority
 from mrcdrl.common.transport.publications import (
     LatestSubscriber,
     Presence,
     Publisher,
     QueueSubscriber,
+    WatchedPublisher,
 )
 from mrcdrl.common.transport.queries import Client, Server
 from mrcdrl.common.transport.shared_memory import BufferPool
 
 ROUTER_FILE = Path(str(resources.files("mrcdrl.configs"))) / "router.json5"
 _LOG = logging.getLogger("transport")
-_RETRY_S = 0.2
+_PROBE_S = 1.0
+_SPARE_FILES = 200
+_NOBODY = "mrcdrl/nobody"  # a key without a liveliness token
+_NEVER_MS = 1 << 40  # until Zenoh connects a lost session again, after a first attempt
 _ZENOH_FILE = re.compile(r"\.? at /")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/\S+")
 _ENCRYPTED = "tls/"
 _PORT_0 = re.compile(r"[^?#]*:0+(?![^?#])")
+_TCP = re.compile(r"tcp/\[?([^?#]*?)\]?:(\d+)(?![^?#])")
 _LOOPBACK = re.compile(r"[a-z]+/(127\.|\[::1\]|localhost:)")
 _CLIENT_SETTINGS: dict[str, Any] = {
     "mode": "client",
-    "connect/timeout_ms": 2_000,  # for one attempt
+    "connect/timeout_ms": 0,  # one attempt: `random_pauses` says when to try again
     "connect/exit_on_failure": True,
-    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    "connect/retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS},
+    "transport/unicast/open_timeout": 5_000,  # ms
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
+    # Batches of 64 KiB that may wait to be sent, by priority.
     "transport/link/tx/queue/size/data": 16,
+    "transport/link/tx/queue/size/data_low": 4,
     # µs that a full link blocks its sender before it is closed.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
     "transport/shared_memory/enabled": False,  # shared_memory.py has no pool to overflow
@@ -82,6 +95,9 @@ class Session(Closing):
     A client whose link is lost goes on with a new Zenoh session of another identity, on which
     everything is declared again. Under the old identity, a router still clearing away the lost
     link would remove the new declarations too, and the client would hear nothing (zenoh#1886).
+    The lost session tries once to come back, at once, so as not to take a second place. It may
+    have found the router again by then: it is closed only when the router has the new declarations,
+    so that no liveliness token ends with it.
 
     router_file: the router's configuration; by default configs/router.json5. Endpoints that
     `config` gives take the place of the file's.
@@ -115,8 +131,10 @@ class Session(Closing):
         self._session = self._open(settings, time.monotonic() + open_timeout_s)
         self._listener: Any = None
         self._renewer: threading.Thread | None = None
+        self._places: Places | None = None
         if self._listen:
             self._log_who_may_join()
+            self._places = Places(self._session, config.max_peers)
         else:
             self._watch(self._session)
             # daemon: a session that nobody closes must not keep the process alive
@@ -129,6 +147,8 @@ class Session(Closing):
         self._lost.put(None)
         if self._renewer is not None:
             self._renewer.join()
+        if self._places is not None:
+            self._places.close()
         with self._lock:
             declarations, self._declarations = self._declarations, []
             for declaration in reversed(declarations):
@@ -150,11 +170,10 @@ class Session(Closing):
     def _renew(self) -> None:
         """Replace each lost session; the thread `renew`, until the session is closed."""
         while (lost := self._lost.get()) is not None:
-            while lost is self._session and not self._closed.is_set():
-                try:
+            pauses = random_pauses()
+            while lost is self._session and not self._closed.wait(next(pauses)):
+                with contextlib.suppress(zenoh.ZError):
                     self._move_to(zenoh.open(self._settings))
-                except zenoh.ZError:
-                    self._closed.wait(_RETRY_S)
 
     def _move_to(self, fresh: zenoh.Session) -> None:
         """Declare everything on another session and close the present one; raises ZError."""
@@ -165,17 +184,36 @@ class Session(Closing):
                 for declaration in self._declarations:
                     declaration.on(fresh)
                 other, self._session = self._session, fresh
+            _settle(fresh, self._config.timeout_s)
         finally:
             with contextlib.suppress(zenoh.ZError):
                 other.close()  # type: ignore[no-untyped-call]
 
-    def publisher(self, key: str) -> Publisher:
+    def publisher(self, key: str, priority: Priority = Priority.HIGH) -> Publisher:
         """Publisher whose `put` blocks, rather than drops, when the link is full."""
         publisher = Publisher()
         block = zenoh.CongestionControl.BLOCK
         self._declare(
-            lambda on: on.declare_publisher(key, congestion_control=block), publisher.attach
+            lambda on: on.declare_publisher(key, congestion_control=block, priority=priority.value),
+            publisher.attach,
         )
+        return publisher
+
+    def watched_publisher(self, key: str) -> WatchedPublisher:
+        """Publisher whose `watched` says whether anybody has subscribed; a full link drops.
+
+        Only for messages that may be lost, and that one batch of the link can hold (64 KiB).
+        """
+        publisher = WatchedPublisher()
+        handler = zenoh.handlers.Callback(publisher.observe, indirect=False)
+        drop, last = zenoh.CongestionControl.DROP, zenoh.Priority.BACKGROUND
+
+        def make(on: zenoh.Session) -> Any:
+            declared = on.declare_publisher(key, congestion_control=drop, priority=last)
+            publisher.listener = declared.declare_matching_listener(handler)
+            return declared
+
+        self._declare(make, publisher.attach)
         return publisher
 
     def latest_subscriber(self, key: str) -> LatestSubscriber:
@@ -197,6 +235,15 @@ class Session(Closing):
         self._declare(lambda on: on.declare_subscriber(key, handler))
         return waiting
 
+    def passing_subscriber(
+        self, key: str, capacity: int, max_message_bytes: int
+    ) -> tuple[QueueSubscriber, Callable[[], None]]:
+        """A queue subscriber, and what withdraws it."""
+        waiting = QueueSubscriber(max_message_bytes, capacity)
+        handler = zenoh.handlers.Callback(waiting.offer, indirect=False)
+        declaration = self._declare(lambda on: on.declare_subscriber(key, handler))
+        return waiting, lambda: self._withdraw(declaration)
+
     def server(self, key: str, capacity: int = 256) -> Server:
         """Server of queries on `key`; while `capacity` wait, it throttles new ones."""
         server = Server(key, self._config.max_message_bytes, capacity)
@@ -205,11 +252,18 @@ class Session(Closing):
         return server
 
     def client(
-        self, key: str, whom: str, timeout_s: float | None = None, *, shared_memory: bool = False
+        self,
+        key: str,
+        whom: str,
+        timeout_s: float | None = None,
+        *,
+        priority: Priority = Priority.NORMAL,
+        shared_memory: bool = False,
     ) -> Client:
         """Client of the queryable on `key`; `whom` names the peer in errors and in the log.
 
-        shared_memory: large messages go through shared memory if the peer can reach it.
+        priority: of its queries, and of their answers. shared_memory: large messages go through
+        shared memory if the peer can reach it.
         """
         timeout = self._config.timeout_s if timeout_s is None else timeout_s
         pool = BufferPool(whom, enabled=shared_memory and self._config.shared_memory)
@@ -220,6 +274,7 @@ class Session(Closing):
                 target=zenoh.QueryTarget.BEST_MATCHING,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout,
+                priority=priority.value,
             ),
             client.attach,
         )
@@ -266,6 +321,16 @@ class Session(Closing):
             declaration.declared.undeclare()
 
     def _open(self, settings: zenoh.Config, deadline: float) -> zenoh.Session:
+        """Open a Zenoh session; a client tries again until the deadline, and says why it must."""
+        if self._listen:
+            allowed = allow_open_files(_files(self._config.max_peers))
+            if allowed < self._config.max_peers + _SPARE_FILES:
+                _LOG.warning(
+                    "transport.max_peers is %d, but the system allows %d open files: raise that "
+                    "limit (ulimit -Hn), or fewer can join",
+                    *(self._config.max_peers, allowed),
+                )
+        told, pauses = False, random_pauses()
         while True:
             try:
                 return zenoh.open(settings)
@@ -275,12 +340,25 @@ class Session(Closing):
                         f"cannot listen on {', '.join(self._listen)}: in use, or not an address of "
                         f"this machine ({_first_line(error)})"
                     ) from error
-                if time.monotonic() > deadline:
-                    refused = ", or does not accept this certificate" * bool(self._config.key)
-                    raise UnreachableError(
-                        f"nobody answers at {', '.join(self._connect)}{refused}; is the run up? "
-                        f"({_first_line(error)})"
-                    ) from error
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    raise UnreachableError(f"{self._refusal()} ({_first_line(error)})") from error
+                if not told and any(map(_is_open, self._connect)):
+                    _LOG.warning("%s; trying again for %.0f s", self._refusal(), left_s)
+                    told = True
+                time.sleep(min(next(pauses), left_s))
+
+    def _refusal(self) -> str:
+        """Why this client is not let in, as far as that can be known from outside."""
+        where, full = ", ".join(self._connect), "all places (its transport.max_peers) are taken"
+        if self._config.key:
+            return (
+                f"nobody answers at {where}, or does not accept this certificate, or {full}; "
+                "is the run up?"
+            )
+        if any(map(_is_open, self._connect)):
+            return f"{where} does not let this process in: {full}, it hangs, or it is not a router"
+        return f"nobody answers at {where}; is the run up?"
 
     def _log_who_may_join(self) -> None:
         where = ", ".join(self._listen)
@@ -301,6 +379,32 @@ class Session(Closing):
         return f"<Session {', '.join(ends)} {state}>"
 
 
+def _settle(session: zenoh.Session, timeout_s: float) -> None:
+    """Wait until the router knows all that the session declared; raises ZError.
+
+    It handles the messages of a link in order, but those of two links in any.
+    """
+    for _ in session.liveliness().get(_NOBODY, timeout=timeout_s):
+        pass
+
+
+def _files(max_peers: int) -> int:
+    """Open files of a router: peers that have joined, as many that are about to, and others."""
+    return 2 * max_peers + _SPARE_FILES
+
+
+def _is_open(endpoint: str) -> bool:
+    """Whether a process listens on a TCP endpoint, whoever it is."""
+    found = _TCP.match(endpoint)
+    if found is None:
+        return False
+    try:
+        socket.create_connection((found[1], int(found[2])), _PROBE_S).close()
+    except (OSError, OverflowError):
+        return False
+    return True
+
+
 def free_endpoint() -> str:
     """A TCP endpoint on loopback with a port that is free now."""
     with socket.socket() as probe:
@@ -310,7 +414,7 @@ def free_endpoint() -> str:
 
 def _first_line(error: Exception) -> str:
     """What Zenoh says, without the file of its own that it names."""
-    return _ZENOH_FILE.split(str(error).splitlines()[0])[0][:120]
+    return _ZENOH_FILE.split(str(error).splitlines()[0])[0][:120].strip()
 
 
 def _endpoints(settings: zenoh.Config, side: str) -> tuple[str, ...]:
@@ -359,6 +463,8 @@ def _router_settings(config: TransportConfig) -> dict[str, Any]:
     return {
         "access_control/enabled": bool(config.key),
         "transport/link/rx/max_message_size": 2 * config.max_message_bytes,
+        "transport/unicast/max_sessions": config.max_peers,
+        "transport/unicast/accept_pending": config.max_peers,
     }
 
 

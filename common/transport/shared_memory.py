@@ -21,6 +21,7 @@ import sys
 import weakref
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,8 @@ LARGE_BYTES = 32 << 10  # smaller messages are as fast over the network
 _NAME = "mrcdrl-slot"
 _ADDRESS = re.compile(r"([0-9a-f-]{36}) (\d{1,10}) (\d{1,10}) ([0-9a-f]{32})")
 _TOKEN_BYTES = 16
-_MAX_MAPPED = 1024  # one or two a client; those of dead clients go when the next is mapped
+_MAX_MAPPED = 4096  # one or two a client
+_CHECKED = 2  # buffers looked at when another is mapped: has the client closed them?
 _SEALS = (
     fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL if sys.platform == "linux" else 0
 )
@@ -117,6 +119,7 @@ class OpenedBuffers:
 
     def __init__(self) -> None:
         self._mapped: OrderedDict[str, memoryview] = OrderedDict()
+        self._to_check: OrderedDict[str, None] = OrderedDict()  # those mapped, by their turn
 
     def open(self, address: str) -> memoryview:
         """Memory of a client's buffer; raises SharedMemoryError, saying why it is out of reach."""
@@ -125,16 +128,23 @@ class OpenedBuffers:
             memory = _map(address)
             self._forget_closed()
             self._mapped[address] = memory
+            self._to_check[address] = None
         self._mapped.move_to_end(address)
         while len(self._mapped) > _MAX_MAPPED:
-            self._mapped.popitem(last=False)
+            self._to_check.pop(self._mapped.popitem(last=False)[0], None)
         return memory
 
     def _forget_closed(self) -> None:
-        for address in [a for a in self._mapped if not _is_buffer(_path(a))]:
-            del self._mapped[address]
+        """Look at some in turn, so that a further one costs the same however many are mapped."""
+        for _ in range(min(_CHECKED, len(self._to_check))):
+            address, _ = self._to_check.popitem(last=False)
+            if _is_buffer(_path(address)):
+                self._to_check[address] = None
+            else:
+                del self._mapped[address]
 
 
+@cache
 def _boot_id() -> str:
     return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
 

@@ -18,6 +18,7 @@ from mrcdrl.common.model.exploration import epsilons
 from mrcdrl.common.model.policy import Policy, make_policy
 from mrcdrl.common.model.q_network import resolve_device
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.broadcast import Broadcast
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.sync.lockstep import Lockstep
 from mrcdrl.common.sync.stats import StatsReporter
@@ -41,7 +42,9 @@ class Actor:
         session: Session,
         sender: Sender,
         lease: LeaseClient,
+        broadcast: Broadcast | None = None,
     ) -> None:
+        """broadcast: is shown one of the arenas, while anybody watches; custom worlds are not."""
         keys, worker = joining.keys, joining.worker
         self._config = config
         self._worker = worker
@@ -49,11 +52,14 @@ class Actor:
         self._lease = lease
         self._reader = WeightsReader(session, keys, self._adopt)
         self._episodes = session.publisher(keys.episodes(worker))
-        self._reporter = StatsReporter(
+        self.reporter = StatsReporter(
             session.publisher(keys.stats("actor", worker)), "actor", worker, warms_up=True
         )
-        self._policy = make_policy(config, resolve_device(config.actor.device, "actor.device"))
-        self._collector = make_collector(config, worker, self._policy)
+        self._policy = make_policy(
+            config, resolve_device(config.actor.device, "actor.device"), averages=False
+        )
+        self._broadcast = None if config.arena.is_custom else broadcast
+        self._collector = make_collector(config, worker, self._policy, broadcast=self._broadcast)
         self._adopted_s = time.monotonic()
         self._epsilons = self._explore(lease.rank)
         self._waited_s = 0.0
@@ -65,7 +71,7 @@ class Actor:
         self._epsilons = self._explore(self._lease.rank)
         while not stop.is_set():
             self._advance(stop)
-        self._reporter.publish(self._metrics)
+        self.reporter.publish(self._metrics)
 
     def _advance(self, stop: StopSignal) -> None:
         """Adopt newer weights, step every arena once, send the result."""
@@ -76,7 +82,7 @@ class Actor:
         self, chunks: Sequence[Chunk], episodes: Sequence[EpisodeSummary], stop: StopSignal
     ) -> None:
         """Spool the chunks, publish the episode summaries, report."""
-        self._reporter.warmed_up()
+        self.reporter.warmed_up()
         began_s = time.monotonic()
         self._sender.put_all(chunks, stop, self._report_waiting)
         self._waited_s += time.monotonic() - began_s
@@ -86,13 +92,13 @@ class Actor:
 
     def _report_waiting(self) -> None:
         self._lease.follow()
-        self._reporter.worked(self._sender.heard_s)
-        self._reporter.publish_if_due(self._metrics)
+        self.reporter.worked(self._sender.heard_s)
+        self.reporter.publish_if_due(self._metrics)
 
     def _report(self) -> None:
         self._lease.follow()
-        self._reporter.worked()
-        self._reporter.publish_if_due(self._metrics)
+        self.reporter.worked()
+        self.reporter.publish_if_due(self._metrics)
 
     def _adopt_newer(self) -> None:
         """Adopt newer weights; update epsilon when they or the exploration rank changed."""
@@ -160,8 +166,9 @@ class LockstepActor(Actor):
         sender: Sender,
         lease: LeaseClient,
         lockstep: Lockstep,
+        broadcast: Broadcast | None = None,
     ) -> None:
-        super().__init__(config, joining, session, sender, lease)
+        super().__init__(config, joining, session, sender, lease, broadcast)
         self._lockstep = lockstep
         self._done = -1  # the last turn collected
 
@@ -177,7 +184,9 @@ class LockstepActor(Actor):
 
     def _collect(self, turn: int, stop: StopSignal) -> None:
         """Make the turn's transitions in new episodes, as if this were the only actor."""
-        collector = make_collector(self._config, self._worker, self._policy, turn)
+        collector = make_collector(
+            self._config, self._worker, self._policy, turn, broadcast=self._broadcast
+        )
         collector.continue_counts(self._collector)
         self._collector, self._epsilons = collector, self._explore(ALONE)
         for left in reversed(range(self._lockstep.transitions(turn) // collector.num_robots)):
@@ -187,7 +196,11 @@ class LockstepActor(Actor):
 
 
 def make_collector(
-    config: Config, worker: str, policy: Policy, turn: int | None = None
+    config: Config,
+    worker: str,
+    policy: Policy,
+    turn: int | None = None,
+    broadcast: Broadcast | None = None,
 ) -> Collector:
     """Build the arenas, codec and chunkers of one actor; its name enters the seeds.
 
@@ -206,7 +219,8 @@ def make_collector(
     incarnation = time.time_ns() if turn is None else turn
     chunking = ChunkerConfig.from_config(config, worker, incarnation)
     codec = make_codec(config.arena)
-    return Collector(config, chunking, arenas, codec, policy, np.random.default_rng(policy_seed))
+    rng = np.random.default_rng(policy_seed)
+    return Collector(config, chunking, arenas, codec, policy, rng, broadcast)
 
 
 def arena_identity(worker: str, arena: int) -> int:

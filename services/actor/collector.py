@@ -11,18 +11,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mrcdrl.common.arena import ArenaBatch, CountingBatch, ObservationCodec
+from mrcdrl.common.arena import Arenas, ObservationCodec
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import (
+    NUM_ACTIONS,
     Chunk,
     EpisodeSummary,
     Float32Array,
     Float64Array,
     Int64Array,
     TimeStep,
+    TimeSteps,
     UInt8Array,
 )
 from mrcdrl.common.model.policy import FrameStack, Policy
+from mrcdrl.common.sync.broadcast import ARENA, Broadcast, Moment
 from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
 from mrcdrl.services.actor.curriculum import Curriculum
 from mrcdrl.services.actor.training_rewards import TrainingRewards
@@ -56,11 +59,16 @@ class Collector:
         self,
         config: Config,
         chunking: ChunkerConfig,
-        arenas: ArenaBatch | CountingBatch,
+        arenas: Arenas,
         codec: ObservationCodec,
         policy: Policy,
         rng: np.random.Generator,
+        broadcast: Broadcast | None = None,
     ) -> None:
+        """broadcast: is shown one of the arenas, while anybody watches."""
+        self._broadcast = broadcast
+        self._shown_frames = 0  # of the episode that is shown
+        self._q_values: Float32Array = np.zeros((0, NUM_ACTIONS), np.float32)  # as chosen by
         self._actor = chunking.actor
         self._arenas = arenas
         self._codec = codec
@@ -98,6 +106,7 @@ class Collector:
         present = self._arenas.present.copy()
         actions, taken_q, greedy_q = self._select_actions(epsilons, present)
         inferred = time.perf_counter()
+        self._show(actions, float(epsilons[ARENA]))
         time_steps = self._arenas.step(actions)
         stepped = time.perf_counter()
         rewards = self._rewards.after(time_steps, self._policy.learner_step)
@@ -128,6 +137,7 @@ class Collector:
         chunked = time.perf_counter()
         records = time_steps.records.reshape(self.num_robots, -1)
         self._frames.push(self._codec.decode(records))
+        self._show_step(time_steps, float(epsilons[ARENA]))
         self._reset(ended)
         self.env_steps += len(self._arenas)
         self.robot_steps += int(present.sum())
@@ -151,16 +161,40 @@ class Collector:
         per_robot, stacks = np.repeat(epsilons, self._num_robots), self._frames.stacks
         if not self._mixes_numbers:
             chosen = self._policy.select_actions(stacks, per_robot, self._rng)
+            self._q_values = chosen.q_values
             columns = (chosen.actions, chosen.taken_q, chosen.greedy_q)
             return columns[0].reshape(shape), columns[1].reshape(shape), columns[2].reshape(shape)
         there = (np.arange(self._num_robots) < present[:, None]).reshape(-1)
         chosen = self._policy.select_actions(stacks[there], per_robot[there], self._rng)
+        self._q_values = chosen.q_values
         actions, taken_q = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
         greedy_q = np.zeros(shape, np.float32)
         actions.reshape(-1)[there] = chosen.actions
         taken_q.reshape(-1)[there] = chosen.taken_q
         greedy_q.reshape(-1)[there] = chosen.greedy_q
         return actions, taken_q, greedy_q
+
+    def _show(self, actions: UInt8Array, epsilon: float) -> None:
+        """Show the scene of one arena and what was chosen in it, if anybody watches."""
+        if self._broadcast is not None and self._broadcast.watched:
+            number = int(self._arenas.present[ARENA])
+            moment = self._moment(self._episodes[ARENA].frames, epsilon)
+            self._broadcast.acts(moment, self._q_values[:number], actions[ARENA, :number])
+
+    def _show_step(self, time_steps: TimeSteps, epsilon: float) -> None:
+        """Show what the step has come to in that arena."""
+        if self._broadcast is not None and self._broadcast.watched:
+            number, outcome = int(self._arenas.present[ARENA]), time_steps.outcomes[ARENA]
+            # an episode that has ended is summed up, and its frames are counted from 0 again
+            last = None if outcome is None else self._moment(self._shown_frames, epsilon)
+            self._broadcast.stepped(time_steps.collided[ARENA, :number], last, outcome)
+
+    def _moment(self, frame: int, epsilon: float) -> Moment:
+        number = int(self._arenas.present[ARENA])
+        images = self._frames.stacks[:number, -1].copy()
+        scene = self._arenas.scene(ARENA)
+        self._shown_frames = frame + 1
+        return Moment(frame, scene, images, self._policy.weights_version, epsilon)
 
     def _add(
         self,
@@ -217,4 +251,5 @@ class Collector:
             epsilon=epsilon,
             weights_version=max(min(episode.versions), 0),
             mean_q=episode.greedy_q / episode.frames,
+            num_robots=number,
         )

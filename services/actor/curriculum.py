@@ -1,5 +1,8 @@
 """How often an actor plays each number of robots: by a schedule, or by its successes so far.
 
+The greatest number may be played alone at first: with as many targets as robots, somebody is soon
+near one, and what is learned from that serves the others.
+
 Invariants: pure; chances sum to 1. A weight is a share of the transitions, because those are what
 is learned from: an episode of a number counts as many as its robots have made on average. The
 automatic weight is p (1 - p), p the success so far (Tzannetos et al. 2023, "Proximal Curriculum for
@@ -53,6 +56,8 @@ class Curriculum:
 
     def weights(self, learner_step: int) -> Float64Array:
         """Shares of the transitions that each number should have; they sum to 1."""
+        if learner_step < self._config.greatest_first_steps:
+            return np.array([0.0] * (len(self._numbers) - 1) + [1.0])
         if self._config.kind == "automatic":
             learnable = _normalized(self.success_rates * (1 - self.success_rates))
             floor = self._config.floor

@@ -14,7 +14,7 @@ import time
 from mrcdrl.common.errors import TransportError, WireError
 from mrcdrl.common.messages.trajectory import NO_SLOT, LeaseReply, LeaseRequest
 from mrcdrl.common.messages.wire import decode, encode
-from mrcdrl.common.transport import PendingReply, Session
+from mrcdrl.common.transport import PendingReply, Priority, Session
 from mrcdrl.common.transport.keys import Keys
 
 _LOG = logging.getLogger("actor")
@@ -65,7 +65,7 @@ class LeaseClient:
 
     def __init__(self, session: Session, keys: Keys, actor: str, lease_s: float) -> None:
         self._answer_s = min(_ANSWER_S, lease_s / (2 * _RENEWALS))
-        self._client = session.client(keys.leases, "replay", self._answer_s)
+        self._client = session.client(keys.leases, "replay", self._answer_s, priority=Priority.HIGH)
         self._lease = Lease(actor, time.time_ns())
         self._period_s = lease_s / _RENEWALS
         self._pending: PendingReply | None = None

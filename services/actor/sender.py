@@ -21,7 +21,7 @@ class Sender:
 
     def __init__(self, writer: ReplayWriter, spool_chunks: int) -> None:
         self._writer = writer
-        self._spool: queue.Queue[Chunk] = queue.Queue(spool_chunks)
+        self._spool: queue.Queue[Chunk | None] = queue.Queue(spool_chunks)  # None: closing
         self._closing = threading.Event()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="sender")
@@ -72,19 +72,12 @@ class Sender:
     def close(self) -> None:
         """Send the spooled chunks if replay accepts them at once, then end the thread."""
         self._closing.set()
+        with contextlib.suppress(queue.Full):  # then the thread does not wait, and sees the flag
+            self._spool.put_nowait(None)
         self._thread.join()
 
     def _run(self) -> None:
-        while True:
-            try:
-                chunks = [self._spool.get(timeout=_POLL_S)]
-            except queue.Empty:
-                if self._closing.is_set():
-                    return
-                continue
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    chunks.append(self._spool.get_nowait())
+        while chunks := self._take():
             try:
                 reply = self._writer.insert(chunks)
             except Exception as error:  # noqa: BLE001  re-raised by put, in the owner's thread
@@ -94,3 +87,11 @@ class Sender:
                 return
             self.chunks += len(chunks)
             self.transitions += sum(map(len, chunks))
+
+    def _take(self) -> list[Chunk]:
+        """All chunks that wait, at least one; none when closing."""
+        waiting = [] if self._closing.is_set() else [self._spool.get()]
+        with contextlib.suppress(queue.Empty):
+            while True:
+                waiting.append(self._spool.get_nowait())
+        return [chunk for chunk in waiting if chunk is not None]

@@ -1,6 +1,8 @@
-"""Rewards as a run learns from them: the arena's, changed by schedules of `agent`.
+"""Rewards as a run learns from them: the arena's, changed by settings of `agent`.
 
-A collision costs what the schedule says at the time. Potential-based shaping (Ng, Harada & Russell
+A collision costs what the schedule says at the time. A target that another robot is nearer to pays
+nothing where `occupied_targets_pay` is off: the paper's reward pays more for waiting beside it than
+for leaving. Potential-based shaping (Ng, Harada & Russell
 1999) adds, for each robot and frame,
 
     F = gamma Phi(s', t') - Phi(s, t),   Phi(s, t) = -c(t) d(s),
@@ -19,17 +21,24 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrcdrl.common.arena import ArenaBatch, CountingBatch
+from mrcdrl.common.arena import Arenas
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.schedule import value_at
-from mrcdrl.common.messages.trajectory import Float64Array, Int64Array, TimeSteps
+from mrcdrl.common.messages.trajectory import (
+    BoolArray,
+    Float64Array,
+    Int64Array,
+    Outcome,
+    TimeSteps,
+)
 
 
 class TrainingRewards:
     """The rewards of all robots of an actor: `start` at each episode, `after` at each step."""
 
-    def __init__(self, config: Config, arenas: ArenaBatch | CountingBatch) -> None:
+    def __init__(self, config: Config, arenas: Arenas) -> None:
         self._agent = config.agent
+        self._off_target = config.arena.step_reward
         self._arenas = arenas
         self._every = np.arange(len(arenas))
         # of the states that the robots are in
@@ -44,6 +53,8 @@ class TrainingRewards:
     def after(self, time_steps: TimeSteps, learner_step: int) -> Float64Array:
         """Rewards [A, K] of a step of all arenas, before an ended one starts anew."""
         agent, rewards = self._agent, time_steps.rewards.astype(np.float64)
+        if not agent.occupied_targets_pay:
+            rewards[self._paid_for_occupied(time_steps)] = self._off_target
         # a robot that collided has the price of it as its whole reward
         rewards[time_steps.collided] *= value_at(agent.collision_schedule, learner_step)
         if not agent.shaping_per_px:
@@ -53,6 +64,13 @@ class TrainingRewards:
         self._potentials = after
         shaped: Float64Array = rewards + agent.gamma * after - before
         return shaped
+
+    def _paid_for_occupied(self, time_steps: TimeSteps) -> BoolArray:
+        """The robots [A, K] whose reward can be for a target that another one is nearer to."""
+        occupied = self._arenas.drawn_to_occupied(self._every) & ~time_steps.collided
+        succeeded = [outcome is Outcome.SUCCESS for outcome in time_steps.outcomes]
+        occupied[succeeded] = False
+        return occupied
 
     def _potentials_of(self, arenas: Int64Array, learner_step: int) -> Float64Array:
         """Phi [N, K] of the robots' states in these arenas."""

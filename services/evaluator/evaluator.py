@@ -14,19 +14,20 @@ from mrcdrl.common.arena import Start, make_codec, test_starts
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.metrics import EvaluatorMetrics
-from mrcdrl.common.messages.trajectory import Evaluation, Weights
+from mrcdrl.common.messages.trajectory import Evaluation, Outcome, Weights
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.model.policy import make_policy
 from mrcdrl.common.model.weights_files import read_weights, write_weights
 from mrcdrl.common.runtime.files import BEST_WEIGHTS
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.repeats import is_logged
+from mrcdrl.common.sync.broadcast import Broadcast
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session
 from mrcdrl.services.evaluator.score import evaluation
-from mrcdrl.services.evaluator.trial import PolicyPlayer, play
+from mrcdrl.services.evaluator.trial import EpisodeResult, PolicyPlayer, Show, play
 
 _LOG = logging.getLogger("evaluator")
 _POLL_S = 0.2
@@ -45,20 +46,26 @@ class Evaluator:
         session: Session,
         stop: StopSignal,
         after_first: Callable[[], None] = lambda: None,
+        broadcast: Broadcast | None = None,
     ) -> None:
-        """after_first: called once the first evaluation is published."""
+        """after_first: called once the first evaluation is published.
+
+        broadcast: is shown one of the arenas, while anybody watches; custom worlds are not.
+        """
+        broadcast = None if config.arena.is_custom else broadcast
         keys, worker = joining.keys, joining.worker
         self._settings = config.evaluator
         self._stop = stop
         self._after_first = after_first
-        self._reporter = StatsReporter(
+        self.reporter = StatsReporter(
             session.publisher(keys.stats("evaluator", worker)), "evaluator", worker, warms_up=True
         )
-        self._evaluate_all = AllNumbers(config, worker, self._before_frame)
+        self._evaluate_all = AllNumbers(config, worker, self._before_frame, broadcast)
         self._reader = WeightsReader(session, keys, self._evaluate_all.adopt)
         self._best = BestWeights(
             joining.run_dir / BEST_WEIGHTS,
             AllNumbers(confirming(config), worker, self._before_frame),
+            by_return=config.arena.is_custom,
         )
         self._publisher = session.publisher(keys.evaluation(worker))
         self._frames = 0  # each of many arenas
@@ -117,7 +124,7 @@ class Evaluator:
     def _before_frame(self) -> bool:
         """Report, as each frame is work done; whether to play it."""
         if self._frames:
-            self._reporter.warmed_up()
+            self.reporter.warmed_up()
         self._frames += 1
         return self._keep_going()
 
@@ -126,8 +133,8 @@ class Evaluator:
         return not self._stop.is_set()
 
     def _report(self) -> None:
-        self._reporter.worked()
-        self._reporter.publish_if_due(self._metrics)
+        self.reporter.worked()
+        self.reporter.publish_if_due(self._metrics)
 
     def _metrics(self) -> EvaluatorMetrics:
         return EvaluatorMetrics(
@@ -151,9 +158,11 @@ def confirming(config: Config) -> Config:
 class WeightsEvaluator:
     """Evaluates weights by the paper's test, from the same starts each time."""
 
-    def __init__(self, config: Config, worker: str) -> None:
+    def __init__(self, config: Config, worker: str, broadcast: Broadcast | None = None) -> None:
+        """broadcast: is shown one of the arenas, while anybody watches."""
         self._config = config
         self._worker = worker
+        self._broadcast = broadcast
         self._policy = make_policy(config)
         self._starts: tuple[Start, ...] = test_starts(
             config.arena, config.evaluator.episodes, config.evaluator.seed
@@ -163,9 +172,19 @@ class WeightsEvaluator:
         """Take the weights to evaluate; raises CheckpointError for another network's."""
         self._policy.adopt(weights)
 
+    def _parts(self) -> list[tuple[Start, ...]]:
+        """The first starts, and those that are played only if one of the first succeeds.
+
+        Of a custom world all are played: its return counts, whether it knows success or not.
+        """
+        probe = 0 if self._config.arena.is_custom else self._config.evaluator.probe_episodes
+        first = probe or len(self._starts)
+        return [part for part in (self._starts[:first], self._starts[first:]) if part]
+
     def evaluate(self, weights: Weights, keep_going: Callable[[], bool]) -> Evaluation | None:
         """Evaluate the weights; None without starts, and as soon as `keep_going` returns False.
 
+        Ends after the probe episodes if none of them succeeds; the result then counts those alone.
         Raises CheckpointError for weights of another network.
         """
         if not self._starts:
@@ -179,9 +198,18 @@ class WeightsEvaluator:
             config.evaluator.epsilon,
             np.random.default_rng(config.evaluator.seed),
         )
-        results = play(config.arena, self._starts, player, keep_going=lambda _done: keep_going())
-        if results is None:
-            return None
+        broadcast = self._broadcast
+        show = None if broadcast is None else Show(broadcast, player, weights.version)
+        results: list[EpisodeResult] = []
+        for starts in self._parts():
+            if results and not any(result.outcome is Outcome.SUCCESS for result in results):
+                break
+            part = play(
+                config.arena, starts, player, keep_going=lambda _done: keep_going(), show=show
+            )
+            if part is None:
+                return None
+            results += part
         return evaluation(
             results,
             worker=self._worker,
@@ -195,9 +223,20 @@ class WeightsEvaluator:
 class AllNumbers:
     """Evaluates weights with each number of robots that an episode may have."""
 
-    def __init__(self, config: Config, worker: str, keep_going: Callable[[], bool]) -> None:
-        """keep_going: called again and again; an evaluation ends as soon as it returns False."""
-        self._evaluators = [WeightsEvaluator(one, worker) for one in config.each_number()]
+    def __init__(
+        self,
+        config: Config,
+        worker: str,
+        keep_going: Callable[[], bool],
+        broadcast: Broadcast | None = None,
+    ) -> None:
+        """keep_going: called again and again; an evaluation ends as soon as it returns False.
+
+        broadcast: is shown one of the arenas, while anybody watches.
+        """
+        self._evaluators = [
+            WeightsEvaluator(one, worker, broadcast) for one in config.each_number()
+        ]
         self._keep_going = keep_going
 
     def adopt(self, weights: Weights) -> None:
@@ -233,43 +272,57 @@ class BestWeights:
         self,
         path: Path,
         confirm: Callable[[Weights], Sequence[Evaluation]] = lambda _weights: (),
+        *,
+        by_return: bool = False,
     ) -> None:
-        """confirm: evaluates weights again; nothing where it does not, or was stopped."""
+        """confirm: evaluates weights again; nothing where it does not, or was stopped.
+
+        by_return: of equal success the greater return ranks higher, not the fewer frames.
+        """
         self._path = path
         self._confirm = confirm
+        self._by_return = by_return
 
     def offer(self, weights: Weights, results: Sequence[Evaluation]) -> None:
         """Keep the weights if they scored better: more successes, or as many in fewer frames.
 
         results: one for each number of robots. The number that succeeds least counts most, and
-        then the mean over all of them.
+        then the mean over all of them. Of weights without a success the newest are kept.
         """
-        if _rank(results) <= self._rank():
+        if not self._is_better(results):
             return
-        if _rank(results)[0] >= _WORTH_CONFIRMING:
+        if self._rank(results)[0] >= _WORTH_CONFIRMING:
             results = self._confirm(weights) or results
-        if _rank(results) > self._rank():
+        if self._is_better(results):
             write_weights(self._path, weights.payload, _manifest(results))
 
-    def _rank(self) -> tuple[float, float, float]:
+    def _is_better(self, results: Sequence[Evaluation]) -> bool:
+        rank, kept = self._rank(results), self._kept_rank()
+        return rank > kept or (rank == kept and not any(each.success_rate for each in results))
+
+    def _rank(self, results: Sequence[Evaluation]) -> tuple[float, float, float]:
+        weakest = _weakest(results)
+        mean = fmean(result.success_rate for result in results)
+        last = weakest.mean_score if self._by_return else -weakest.mean_frames
+        return (weakest.success_rate, mean, last)
+
+    def _kept_rank(self) -> tuple[float, float, float]:
         """Rank the kept weights, read again because another evaluator may have replaced them."""
         try:
             _, manifest = read_weights(self._path)
         except CheckpointError:
             manifest = {}
-        rate, frames = manifest.get("success_rate", -1), manifest.get("mean_frames", np.inf)
+        rate = float(manifest.get("success_rate", -1))
         by_robots = manifest.get(_BY_ROBOTS) or {"": rate}
-        return (float(rate), fmean(map(float, by_robots.values())), -float(frames))
+        if self._by_return:
+            last = float(manifest.get("mean_score", -np.inf))
+        else:
+            last = -float(manifest.get("mean_frames", np.inf))
+        return (rate, fmean(map(float, by_robots.values())), last)
 
 
 def _weakest(results: Sequence[Evaluation]) -> Evaluation:
     return min(results, key=lambda result: result.success_rate)
-
-
-def _rank(results: Sequence[Evaluation]) -> tuple[float, float, float]:
-    weakest = _weakest(results)
-    mean = fmean(result.success_rate for result in results)
-    return (weakest.success_rate, mean, -weakest.mean_frames)
 
 
 def _manifest(results: Sequence[Evaluation]) -> dict[str, Any]:

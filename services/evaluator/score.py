@@ -11,16 +11,16 @@ import numpy as np
 from mrcdrl.common.messages.trajectory import Evaluation, Outcome, Weights
 from mrcdrl.services.evaluator.trial import EPISODES_PER_BLOCK, EpisodeResult
 
-_Z95 = 1.959964  # quantile of the normal distribution for a two-sided 95 % interval
+Z95 = 1.959964  # quantile of the normal distribution for a two-sided 95 % interval
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:
     """95 % confidence interval of a rate (Wilson 1927); (0, 1) without observations."""
     if count == 0:
         return (0.0, 1.0)
-    rate, z2 = successes / count, _Z95**2
+    rate, z2 = successes / count, Z95**2
     centre = (rate + z2 / (2 * count)) / (1 + z2 / count)
-    half = _Z95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
+    half = Z95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
     # At rates of 0 and 1 one bound is the rate itself; rounding could miss it.
     return (min(rate, max(0.0, centre - half)), max(rate, min(1.0, centre + half)))
 

@@ -11,21 +11,24 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mrcdrl.common.arena import ArenaBatch, ObservationCodec, Scene, Start
+from mrcdrl.common.arena import ArenaBatch, CustomBatch, ObservationCodec, Scene, Start
 from mrcdrl.common.arena.controllers import Controller
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import (
     NUM_ACTIONS,
     BoolArray,
+    Float32Array,
     Float64Array,
     Outcome,
     TimeStep,
     UInt8Array,
 )
 from mrcdrl.common.model.policy import FrameStack, Policy
+from mrcdrl.common.sync.broadcast import ARENA, Broadcast, Moment
 from mrcdrl.services.evaluator.navigation import Journey, journey
 
-_MAX_ARENAS = 64
+MAX_ARENAS = 64  # played at once
+MAX_CUSTOM = 8  # copies of a custom world likewise
 EPISODES_PER_BLOCK = 100  # of Table 2
 
 
@@ -76,9 +79,10 @@ class PolicyPlayer:
         self._num_robots = config.num_robots
         self._codec = codec
         self._policy = policy
-        self._epsilon = epsilon
+        self.epsilon = epsilon
         self._rng = rng
-        self._frames = FrameStack(_MAX_ARENAS * config.num_robots, config.stack, config.view_px)
+        self._q_values: Float32Array = np.zeros((0, NUM_ACTIONS), np.float32)
+        self._frames = FrameStack(MAX_ARENAS * config.num_robots, config.stack, config.view_px)
         self.explored = np.zeros((0, config.num_robots), np.bool_)
 
     def begin(self, arena: int, time_step: TimeStep) -> None:
@@ -88,7 +92,8 @@ class PolicyPlayer:
 
     def act(self, arenas: NDArray[np.int64], scenes: Sequence[Scene]) -> UInt8Array:
         stacks = self._frames.stacks[self._robots(arenas)]
-        selection = self._policy.select_actions(stacks, self._epsilon, self._rng)
+        selection = self._policy.select_actions(stacks, self.epsilon, self._rng)
+        self._q_values = selection.q_values
         actions = selection.actions.reshape(len(arenas), self._num_robots)
         self.explored = actions != selection.q_values.argmax(axis=1).reshape(actions.shape)
         return actions
@@ -96,6 +101,17 @@ class PolicyPlayer:
     def observe(self, arenas: NDArray[np.int64], records: UInt8Array) -> None:
         images = self._codec.decode(records.reshape(-1, records.shape[-1]))
         self._frames.push(images, self._robots(arenas))
+
+    @property
+    def first_q_values(self) -> Float32Array:
+        """Values [K, NUM_ACTIONS] by which the actions of the first arena were chosen last."""
+        return self._q_values[: self._num_robots]
+
+    @property
+    def first_images(self) -> UInt8Array:
+        """A copy of the newest images [K, V, V] of the arena ARENA."""
+        images: UInt8Array = self._frames.stacks[: self._num_robots, -1].copy()
+        return images
 
     def _robots(self, arenas: NDArray[np.int64]) -> NDArray[np.int64]:
         robots: NDArray[np.int64] = arenas[:, None] * self._num_robots + np.arange(self._num_robots)
@@ -133,6 +149,33 @@ class ControllerPlayer:
         """Ignore the images."""
 
 
+class Show:
+    """Shows people the arena ARENA of those that a policy's player plays."""
+
+    def __init__(self, broadcast: Broadcast, player: PolicyPlayer, weights_version: int) -> None:
+        self._broadcast = broadcast
+        self._player = player
+        self._weights_version = weights_version
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody watches."""
+        return self._broadcast.watched
+
+    def acts(self, frame: int, scene: Scene, actions: UInt8Array) -> None:
+        """Show the scene before a step, and the actions [K] chosen in it."""
+        self._broadcast.acts(self._moment(frame, scene), self._player.first_q_values, actions)
+
+    def stepped(self, frame: int, scene: Scene, time_step: TimeStep) -> None:
+        """Show what the step came to."""
+        last = self._moment(frame, scene) if time_step.last else None
+        self._broadcast.stepped(time_step.collided, last, time_step.outcome)
+
+    def _moment(self, frame: int, scene: Scene) -> Moment:
+        images, epsilon = self._player.first_images, self._player.epsilon
+        return Moment(frame, scene, images, self._weights_version, epsilon)
+
+
 @dataclass(slots=True)
 class _Running:
     """An episode in progress."""
@@ -150,17 +193,22 @@ def play(
     keep_paths: bool = False,
     keep_failed_paths: bool = False,
     keep_going: Callable[[int], bool] = lambda _done: True,
+    show: "Show | None" = None,
 ) -> list[EpisodeResult] | None:
     """Play an episode from each start; return the results in the order of the starts.
 
     keep_paths: keep each episode's poses and explored actions; keep_failed_paths: those of failures
     only. keep_going: called before each step with the number of finished episodes; None is returned
-    as soon as it returns False.
+    as soon as it returns False. show: is shown the arena ARENA, while anybody watches.
     """
-    num_arenas = min(len(starts), _MAX_ARENAS)
+    num_arenas = min(len(starts), MAX_CUSTOM if config.is_custom else MAX_ARENAS)
     # Starts are given; the generators serve random failures only.
     rngs = [np.random.default_rng(i) for i in range(num_arenas)]
-    arenas = ArenaBatch(config, rngs, max_collisions=1)
+    arenas: ArenaBatch | CustomBatch
+    if config.is_custom:
+        arenas = CustomBatch(config, rngs)
+    else:
+        arenas = ArenaBatch(config, rngs, max_collisions=1)
     results: dict[int, EpisodeResult] = {}
     # One array: many small ones that outlive the network's tensors would fragment the memory.
     paths = np.empty((len(arenas), config.max_frames + 1, config.num_robots, 3), np.float64)
@@ -185,8 +233,13 @@ def play(
         active = np.array(sorted(running))
         scenes = [arenas.scene(i) for i in active]
         actions = player.act(active, scenes)
+        shown = show is not None and active[0] == ARENA and show.watched
+        if show is not None and shown:
+            show.acts(running[ARENA].frames, scenes[0], actions[0])
         steps = arenas.step(actions, active)
         player.observe(active, steps.records)
+        if show is not None and shown:
+            show.stepped(running[ARENA].frames + 1, arenas.scene(ARENA), steps[0])
         for i, (index, scene) in enumerate(zip(active.tolist(), scenes, strict=True)):
             episode = running[index]
             episode.score += float(steps.rewards[i].mean())

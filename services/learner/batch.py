@@ -7,7 +7,7 @@ Shapes: B = transitions, W = records a transition may touch, R = bytes of a reco
 stacked in a state, V = width of an image in px.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, Self
 
@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from typing_extensions import TypeVar
 
-from mrcdrl.common.arena import Symmetry
 from mrcdrl.common.config import ReplayConfig
 from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.errors import WireError
@@ -25,6 +24,30 @@ from mrcdrl.services.learner.rendering import Renderer, SymmetryRows, to_device
 
 S = TypeVar("S", default=Tensor)
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Ahead:
+    """What is known of a batch before its step, since the online network does not matter for it."""
+
+    observation: Any  # as the first layer takes states
+    next_observation: Any
+    next_q: Tensor  # float32 [B, A], of next_observation by the target network
+    target_version: int  # of that network
+
+    def values_of(self, states: object, target_version: int) -> Tensor | None:
+        """The values of these states by that target network, where they are known."""
+        known = states is self.next_observation and target_version == self.target_version
+        return self.next_q if known else None
+
+    def __getitem__(self, rows: slice) -> Self:
+        """What is known of some transitions, as views."""
+        return replace(
+            self,
+            observation=self.observation[rows],
+            next_observation=self.next_observation[rows],
+            next_q=self.next_q[rows],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +61,11 @@ class Batch(Generic[S]):
     next_observation: S  # uint8 [B, S, V, V], k steps later
     importance_weights: Tensor  # float32 [B], largest is 1
     keys: Int64Array  # [B], of the transitions in replay
+    ahead: Ahead | None = None
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """All but the keys."""
+        """What a step needs."""
         return tuple(getattr(self, name) for name in _TENSORS)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
@@ -51,22 +75,24 @@ class Batch(Generic[S]):
 
     def __getitem__(self, rows: slice) -> Self:
         """Some of its transitions, as views."""
-        return replace(self.map(lambda x: x[rows]), keys=self.keys[rows])
+        ahead = None if self.ahead is None else self.ahead[rows]
+        return replace(self.map(lambda x: x[rows]), keys=self.keys[rows], ahead=ahead)
 
-    def with_states(self, change: Callable[[S], T]) -> "Batch[T]":
+    def with_states(self, observation: T, next_observation: T) -> "Batch[T]":
         """The batch with its states in another form."""
         return Batch(
-            change(self.observation),
+            observation,
             self.action,
             self.reward,
             self.discount,
-            change(self.next_observation),
+            next_observation,
             self.importance_weights,
             self.keys,
+            self.ahead,
         )
 
 
-_TENSORS = tuple(field.name for field in fields(Batch) if field.name != "keys")
+_TENSORS = tuple(field.name for field in fields(Batch) if field.name not in {"keys", "ahead"})
 
 
 def importance_exponent_at(replay: ReplayConfig, learner_step: int) -> float:
@@ -88,19 +114,18 @@ def collate(
     render: Renderer,
     stack: int,
     *,
-    symmetries: Sequence[Symmetry] = (),
-    rng: np.random.Generator | None = None,
+    symmetry_rows: SymmetryRows = (),
     beta: float = 0.0,
+    num_actions: int = NUM_ACTIONS,
 ) -> Batch:
     """The batch of these samples, on the renderer's device.
 
-    symmetries: one is drawn by rng for each transition; include the identity among them. beta:
-    of the importance weights; 0 makes them 1.
+    symmetry_rows: symmetries, each with the transitions that undergo it. beta: of the importance
+    weights; 0 makes them 1.
 
     Raises WireError if an action or a bootstrap offset is outside what the records hold.
     """
-    _check(samples, stack)
-    symmetry_rows = _drawn(symmetries, rng, len(samples))
+    _check(samples, stack, num_actions)
     actions = samples.actions.copy()
     for symmetry, rows in symmetry_rows:
         actions[rows] = symmetry.apply_to_actions(actions[rows])
@@ -120,23 +145,11 @@ def collate(
     )
 
 
-def _check(samples: Samples, stack: int) -> None:
+def _check(samples: Samples, stack: int, num_actions: int) -> None:
     if len(samples) == 0:
         raise WireError("a batch without transitions")
-    if int(samples.actions.max()) >= NUM_ACTIONS:
-        raise WireError(f"action {samples.actions.max()} is none of {NUM_ACTIONS}")
+    if int(samples.actions.max()) >= num_actions:
+        raise WireError(f"action {samples.actions.max()} is none of {num_actions}")
     width, last = samples.records.shape[1], int(samples.bootstrap_offsets.max()) + stack
     if last > width:
         raise WireError(f"a transition needs {last} records and has {width}")
-
-
-def _drawn(
-    symmetries: Sequence[Symmetry], rng: np.random.Generator | None, num: int
-) -> SymmetryRows:
-    """One symmetry for each of num rows; none where there are none."""
-    if not symmetries:
-        return ()
-    if rng is None:
-        raise ValueError("symmetries are drawn at random: give an rng")
-    drawn = rng.integers(len(symmetries), size=num)
-    return [(symmetry, np.flatnonzero(drawn == i)) for i, symmetry in enumerate(symmetries)]

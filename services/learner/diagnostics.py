@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.returns import largest_return
-from mrcdrl.common.messages.metrics import NUM_BINS, Bins, DiagnosticMetrics
+from mrcdrl.common.messages.metrics import Q_EDGES, TD_ERROR_EDGES, Bins, DiagnosticMetrics
 from mrcdrl.common.messages.trajectory import Float32Array
 from mrcdrl.common.model.fast_forward import Trace, fast_forward, operands, prepare
 from mrcdrl.services.learner.batch import Batch
@@ -27,9 +27,6 @@ _STATES = 64  # looked at, of a batch
 _TOO_LARGE = 2.0  # times the largest return
 _TOO_DEAD = 0.9
 
-# edges of histogram bins, in units of the largest return
-_Q_EDGES = np.linspace(-1.0, 1.0, NUM_BINS - 1)
-_TD_ERROR_EDGES = 10.0 ** np.linspace(-4.0, 0.0, NUM_BINS - 1)
 _LOOKS_A_HISTOGRAM = 15
 
 
@@ -41,8 +38,8 @@ class Diagnostics:
         self._largest_return = largest_return(config)
         self._warned: set[str] = set()
         self._looks = 0
-        self._q_histogram = Histogram(_Q_EDGES * self._largest_return)
-        self._td_error_histogram = Histogram(_TD_ERROR_EDGES * self._largest_return)
+        self._q_histogram = Histogram(np.array(Q_EDGES) * self._largest_return)
+        self._td_error_histogram = Histogram(np.array(TD_ERROR_EDGES) * self._largest_return)
 
     def look(self, batch: Batch, update: Update) -> DiagnosticMetrics:
         """Metrics after a step on this batch; logs what is alarming.

@@ -17,6 +17,7 @@ from torch import Tensor
 from mrcdrl.common.config import AgentConfig, Config, LearnerConfig
 from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.errors import CheckpointError, DivergedError
+from mrcdrl.common.messages.trajectory import NUM_ACTIONS
 from mrcdrl.common.model.q_network import QNetwork, precision, resolve_device
 from mrcdrl.common.model.weights_io import SENT_AS, load_weights, read_arrays, weights_to_bytes
 from mrcdrl.services.learner.accelerate.cuda_graphs import Capturer, capturer_for
@@ -49,6 +50,7 @@ class Learner:
         *,
         stack: int,
         view_px: int,
+        num_actions: int = NUM_ACTIONS,
         threads: int = 1,
         tuner: ThreadTuner | None = None,
         capturer: Capturer | None = None,
@@ -66,8 +68,16 @@ class Learner:
         dtype = precision(learner.precision, self.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(learner.seed)
-            online = QNetwork(agent.kind, stack=stack, view_px=view_px, compute_dtype=dtype)
-            target = QNetwork(agent.kind, stack=stack, view_px=view_px, compute_dtype=dtype)
+            online, target = (
+                QNetwork(
+                    agent.kind,
+                    stack=stack,
+                    view_px=view_px,
+                    num_actions=num_actions,
+                    compute_dtype=dtype,
+                )
+                for _ in range(2)
+            )
         self.online = online.to(self.device)
         self.target = target.to(self.device).requires_grad_(requires_grad=False)
         self.target.load_state_dict(self.online.state_dict())
@@ -94,6 +104,7 @@ class Learner:
             config.learner,
             stack=config.arena.stack,
             view_px=config.arena.view_px,
+            num_actions=config.arena.action_count,
             threads=threads,
             tuner=tuner,
         )
@@ -135,6 +146,10 @@ class Learner:
                 self.target.load_state_dict(self.online.state_dict())
                 self._step.target_changed()
         return updates
+
+    def ahead(self, batch: Batch) -> Batch:
+        """The batch with a part of its step's work done, by a thread beside that of the steps."""
+        return self._step.ahead(batch)
 
     def payload(self) -> bytes:
         """The parameters for publication: their average where the settings want one.

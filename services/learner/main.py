@@ -13,7 +13,7 @@ from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
 from mrcdrl.common.sync.claim import claim_learner
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.sync.lockstep import Lockstep
-from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.sync.stats import StatsReporter, serve_statistics
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.common.transport import Session
 from mrcdrl.services.learner.accelerate.thread_tuner import ThreadTuner, thread_counts
@@ -41,13 +41,14 @@ def main(argv: Sequence[str]) -> int:
         reporter = StatsReporter(
             session.publisher(keys.stats("learner", worker)), "learner", worker, warms_up=True
         )
+        owned.enter_context(serve_statistics(joining.transport, "learner", joining.run, reporter))
         settings, lockstep = config.learner, Lockstep.from_config(config)
         torch.set_num_threads(1)  # threads share batches, not operations
         learner = make_learner(config)
         torch.backends.cudnn.benchmark = True  # batches are of one size
         exact = lockstep is not None and learner.device.type == "cpu"
         torch.use_deterministic_algorithms(exact)
-        writer = WeightsWriter(session, keys)
+        writer = WeightsWriter(session, keys, 0.0 if lockstep else settings.publish_bytes_per_s)
         owned.callback(writer.close)
         publisher = WeightsPublisher(config, learner, writer, joining.run_dir / "checkpoints")
         reader = ReplayReader.from_config(bulk, keys, config, stop, learner.learner_step)
@@ -60,7 +61,9 @@ def main(argv: Sequence[str]) -> int:
             ThreadPoolExecutor(settings.drawing_threads or available_cores(), "rendering")
         )
         collate = make_collate(config, learner, rendering_threads)
-        prefetcher = Prefetcher(reader, collate, settings.prefetch_batches, stop)
+        # in lockstep no number may follow from which thread was the faster
+        ahead = learner.ahead if learner.device.type == "cpu" and lockstep is None else None
+        prefetcher = Prefetcher(reader, collate, settings.prefetch_batches, stop, ahead)
         owned.callback(prefetcher.close)
         owned.callback(stop.set)  # called first: the threads above end by it
         session.announce(keys.live("learner", worker))

@@ -1,5 +1,7 @@
 """Mini-batches, fetched and decoded by their own thread while the learner computes.
 
+A thread with time to spare, since batches wait, computes a part of the step ahead as well.
+
 Invariant: at most `depth` decoded batches wait; when they do, no further one is requested.
 """
 
@@ -10,7 +12,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 
-from mrcdrl.common.arena import layout_symmetries
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.fitting import Fitting
@@ -21,6 +22,7 @@ from mrcdrl.services.learner.accelerate.side_stream import on_side_stream
 from mrcdrl.services.learner.batch import Batch, collate, importance_exponent_at
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.rendering import make_renderer
+from mrcdrl.services.learner.symmetries import LayoutSymmetries
 from mrcdrl.services.replay.client import ReplayReader
 
 _LOG = logging.getLogger("learner")
@@ -36,9 +38,12 @@ class Prefetcher:
         collate: Callable[[Samples], Batch],
         depth: int,
         stop: StopSignal,
+        ahead: Callable[[Batch], Batch] | None = None,
     ) -> None:
+        """ahead: does a part of a batch's step, while another batch waits."""
         self._reader = reader
         self._collate = collate
+        self._ahead = ahead
         self._ready: queue.Queue[Batch] = queue.Queue(depth)
         self._stop = stop
         self._error: Exception | None = None
@@ -84,6 +89,9 @@ class Prefetcher:
                     return
                 started = time.perf_counter()
                 batch = self._collate(samples)
+                self.decode_s += time.perf_counter() - started
+                if self._ahead is not None and self.ready:
+                    batch = self._ahead(batch)
             except WireError as error:
                 self.refused += 1
                 if is_logged(self.refused):
@@ -92,7 +100,6 @@ class Prefetcher:
             except Exception as error:  # noqa: BLE001  raised again by next, in the owner's thread
                 self._error = error
                 return
-            self.decode_s += time.perf_counter() - started
             self._put(batch)
 
     def _put(self, batch: Batch) -> None:
@@ -112,17 +119,18 @@ def make_collate(
     It raises WireError for samples that do not fit the run.
     """
     fitting = Fitting(config)
-    symmetries = layout_symmetries(config.arena) if config.learner.symmetries else ()
+    symmetries = LayoutSymmetries(config.arena) if config.learner.symmetries else None
     render = make_renderer(config.arena, learner.device, rendering_threads)
 
     def collated(samples: Samples) -> Batch:
         fitting.check(samples)
+        drawn = () if symmetries is None else symmetries.draw(samples.records, learner.rng)
         return collate(
             samples,
             render,
             config.arena.stack,
-            symmetries=symmetries,
-            rng=learner.rng,
+            symmetry_rows=drawn,
+            num_actions=config.arena.action_count,
             beta=importance_exponent_at(config.replay, learner.learner_step),
         )
 

@@ -47,6 +47,13 @@ class GradientStep(Protocol):
         """Learn from these batches of one size, one after the other, each at its rate."""
         ...
 
+    def ahead(self, batch: Batch) -> Batch:
+        """The batch with all that its step needs and the online network does not change.
+
+        Another thread may call it beside a step, for a later one.
+        """
+        ...
+
     def target_changed(self) -> None:
         """The target network has new parameters."""
         ...
@@ -86,6 +93,10 @@ class PlainStep:
         self._learning_rate.fill_(learning_rate)
         self._optimizer.step()
         return Update(found.loss.detach(), found.greedy_q.mean(), norm, found.td_errors)
+
+    def ahead(self, batch: Batch) -> Batch:
+        """Nothing is computed ahead."""
+        return batch
 
     def target_changed(self) -> None:
         """Nothing of the target is kept."""

@@ -1,6 +1,7 @@
 """Follows a run: feeds its messages to the state, the recorder and the stopping rule."""
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 from itertools import chain
@@ -31,6 +32,8 @@ class Follower:
 
     A message counts if its sender holds, or has held, a liveliness token, as every process of a run
     does. One that cannot be folded in is left out, which is said once.
+
+    Whoever reads the state in another thread holds `lock` meanwhile.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class Follower:
         self._state = state
         self._recorder = recorder
         self._rule = rule
+        self.lock = threading.Lock()
         self._watching = Watching()
         self._refused = 0
         if recorder:
@@ -72,6 +76,15 @@ class Follower:
         """Take in all that has arrived, waiting up to `timeout_s` for statistics; whether any
         arrived."""
         first = self._stats.take(timeout_s)
+        with self.lock:
+            self._fold(first)
+        if self._recorder and self.lived_s >= self._record_due_s:
+            self._record_due_s = self.lived_s + 1.0
+            self._recorder.record_metrics(self._state, self.now)
+        return first is not None
+
+    def _fold(self, first: tuple[str, bytes] | None) -> None:
+        """Take in these statistics, and all else that has arrived."""
         with self._watching("following who is up"):
             for key, alive in self._presence.changes():
                 role, worker = role_and_worker(key)
@@ -83,10 +96,6 @@ class Follower:
             self._take(EpisodeSummary, item, self._observe_episode)
         for item in self._evaluations.drain():
             self._take(Evaluation, item, self._observe_evaluation)
-        if self._recorder and self.lived_s >= self._record_due_s:
-            self._record_due_s = self.lived_s + 1.0
-            self._recorder.record_metrics(self._state, self.now)
-        return first is not None
 
     def stop_reason(self, *, learner_ended: bool) -> str | None:
         """Why the run should end now, or None; minutes count from this start.

@@ -1,5 +1,7 @@
 """Records a run as it goes: lines of JSON, TensorBoard events, a summary at the end.
 
+What TensorBoard shows goes to an experiment tracker as well, if the run has one.
+
 Invariants: a line that a crash left unfinished is cut off by the next start; a record is handed to
 the operating system by the next `record_metrics` at the latest; a resumed run appends. What cannot
 be written once the files are open is said once and ends nothing.
@@ -9,17 +11,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mrcdrl.common.config import Config
+from mrcdrl.common.config import Config, to_toml
+from mrcdrl.common.config.returns import largest_return
+from mrcdrl.common.config.settings import all_settings
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.checks import MAX_METRICS
-from mrcdrl.common.messages.metrics import SCHEMAS, kinds
+from mrcdrl.common.messages.metrics import (
+    NUM_BINS,
+    Q_EDGES,
+    SCHEMAS,
+    TD_ERROR_EDGES,
+    kinds,
+)
 from mrcdrl.common.messages.trajectory import EpisodeSummary
 from mrcdrl.common.runtime.closing import Closing
-from mrcdrl.common.runtime.files import METRICS, atomic_write
+from mrcdrl.common.runtime.files import FILM, METRICS, MOVING_PICTURE, PICTURES, atomic_write
 from mrcdrl.services.monitor.events import Events
 from mrcdrl.services.monitor.records import (
     EPISODES,
@@ -36,12 +45,16 @@ from mrcdrl.services.monitor.records import (
 from mrcdrl.services.monitor.state import COUNTERS, RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.monitor.summary import summary_bytes
+from mrcdrl.services.monitor.tracker import Tracker
 from mrcdrl.services.monitor.watching import Watching
 
 SUMMARY = "summary.json"
 TENSORBOARD = "tensorboard"
+_TRACKER = "tracking"
 _RECORDING = "recording"  # as a failure is said
 _KNOWN = {role: kinds(schema) for role, schema in SCHEMAS.items()}
+HISTOGRAMS = {"q": Q_EDGES, "td_error": TD_ERROR_EDGES}  # of the learner
+RESULTS = ("result/best_success_rate", "result/last_success_rate")  # by which runs are compared
 _LARGEST_EVENT = float(np.finfo(np.float32).max)  # TensorBoard keeps float32; NaN is not below
 RATES = tuple(chain.from_iterable(COUNTERS.values()))
 EVALUATION_FIELDS = (
@@ -74,6 +87,16 @@ class Recorder(Closing):
             self._events = _open_events(run_dir / TENSORBOARD)
         except OSError as error:
             raise RunDirectoryError(f"{run_dir} cannot be written: {error}") from error
+        self._tracker: Tracker | None = None
+        with self._watching(_TRACKER):
+            self._tracker = Tracker.of_run(run_dir, config)
+        self._largest_return = largest_return(config)
+        self._histograms: dict[str, tuple[float, ...]] = {}  # as written last
+        if self._events is not None:
+            with self._watching(TENSORBOARD):
+                code = "".join(f"    {line}\n" for line in to_toml(config).splitlines())
+                self._events.add_text("configuration", code)
+                self._events.add_hyperparameters(hyperparameters(config), RESULTS)
 
     def __repr__(self) -> str:
         return f"Recorder({str(self.run_dir)!r}, closed={self._metrics.closed})"
@@ -112,14 +135,38 @@ class Recorder(Closing):
             self._event(f"rates/{name}_per_s", state.per_second(name, now), int(now))
         if (learner := state.learner) is not None:
             for name in learner.metrics.keys() & _KNOWN["learner"].keys():
-                self._event(f"learner/{name}", learner.metrics[name], state.learner_steps)
+                if _KNOWN["learner"][name] != "histogram":
+                    self._event(f"learner/{name}", learner.metrics[name], state.learner_steps)
+            self._record_histograms(learner.metrics, state.learner_steps)
         self.flush()
+        if self._tracker is not None:
+            with self._watching(_TRACKER):
+                self._tracker.tell(now)
 
     def write_summary(self, state: RunState, now: float, stop_reason: str) -> None:
         """Write summary.json in one step."""
         with self._watching(f"writing {SUMMARY}"):
             content = summary_bytes(state, self._config, now, stop_reason)
             atomic_write(self.run_dir / SUMMARY, content)
+        best, last = state.best_evaluation, state.last_evaluation
+        if best is not None and last is not None:
+            step = state.learner_steps
+            self._event("result/best_success_rate", best.evaluation.success_rate, step)
+            self._event("result/last_success_rate", last.evaluation.success_rate, step)
+
+    def record_pictures(self) -> None:
+        """Hand on the plots and films that the run has left."""
+        self.flush()
+        learner_steps = int(read_last_metrics(self.run_dir).get("learner_steps", 0))
+        for name in (*PICTURES, MOVING_PICTURE):
+            path = self.run_dir / name
+            if self._events is not None and path.is_file():
+                with self._watching(TENSORBOARD):
+                    self._events.add_picture(f"run/{path.stem}", path.read_bytes(), learner_steps)
+        if self._tracker is not None:
+            files = [self.run_dir / name for name in (*PICTURES, FILM)]
+            with self._watching(_TRACKER):
+                self._tracker.tell_files([path for path in files if path.is_file()])
 
     def summarize(self, stop_reason: str) -> None:
         """Write summary.json from what is recorded; for a run whose state is lost."""
@@ -147,8 +194,28 @@ class Recorder(Closing):
         if events is not None:
             with self._watching(TENSORBOARD):
                 events.close()
+        tracker, self._tracker = self._tracker, None
+        if tracker is not None:
+            with self._watching(_TRACKER):
+                tracker.close()
+
+    def _record_histograms(self, metrics: Mapping[str, float], step: int) -> None:
+        """Write the learner's histograms, when it has sent new ones."""
+        for name, edges in HISTOGRAMS.items():
+            shares = tuple(metrics.get(f"{name}_bin_{i}", -1.0) for i in range(NUM_BINS))
+            if min(shares) < 0 or max(shares) > 1 or self._histograms.get(name) == shares:
+                continue
+            self._histograms[name] = shares
+            scaled = [edge * self._largest_return for edge in edges]
+            low, high = (metrics.get(f"q_{end}", 0.0) for end in ("min", "max"))
+            span = (low, high) if name == "q" else (0.0, scaled[-1])
+            if self._events is not None and all(abs(end) <= _LARGEST_EVENT for end in span):
+                with self._watching(TENSORBOARD):
+                    self._events.add_histogram(f"learner/{name}", scaled, shares, span, step)
 
     def _event(self, tag: str, value: float, step: int) -> None:
+        if self._tracker is not None and abs(value) <= _LARGEST_EVENT:
+            self._tracker.add(tag, value)
         if self._events is not None and abs(value) <= _LARGEST_EVENT:
             with self._watching(TENSORBOARD):
                 self._events.add(tag, value, step)
@@ -169,8 +236,18 @@ def restore(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
         state.restore_evaluation(evaluation)
         rule.observe_evaluation(evaluation.evaluation)
         time_s = max(time_s, evaluation.time_s)
-    state.restore_counted(metrics, _counted(metrics))
+    state.restore_metrics(metrics)
     return time_s
+
+
+def hyperparameters(config: Config) -> dict[str, float | str]:
+    """Every setting that a run is made with, as section.name; lists as text."""
+    found: dict[str, float | str] = {}
+    for setting in all_settings():
+        value = getattr(getattr(config, setting.section), setting.name)
+        if setting.section != "transport":
+            found[setting.key] = value if isinstance(value, bool | float | int) else str(value)
+    return found
 
 
 def _open_events(directory: Path) -> Events | None:
@@ -200,16 +277,6 @@ def flat_metrics(state: RunState, now: float) -> dict[str, float | int | None]:
     flat.update({f"{name}_per_s": round(state.per_second(name, now), 3) for name in RATES})
     flat.update(_service_metrics(state))
     return flat
-
-
-def _counted(metrics: Mapping[str, Any]) -> dict[tuple[str, str], float]:
-    """The counters of each actor in a line of metrics, by actor and counter."""
-    names = [name.split("/") for name in metrics if name.startswith("actor/")]
-    return {
-        (actor, name): float(metrics[f"actor/{actor}/{name}"])
-        for _, actor, name in names
-        if name in COUNTERS["actor"]
-    }
 
 
 def _service_metrics(state: RunState) -> Iterator[tuple[str, float]]:

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +22,7 @@ EPISODES = "episodes.jsonl"
 EVALUATIONS = "evaluations.jsonl"
 SUCCESS_WINDOW = 100  # episodes over which successes are counted (Table 1, Fig. 6b)
 _TAIL_BYTES = 1 << 20
+_LATEST_BYTES = 1 << 17
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,8 @@ def _pick(values: Mapping[str, Any], message: type) -> dict[str, Any]:
 
 
 def _episode(values: Mapping[str, Any]) -> EpisodeRecord:
-    picked = _pick(values, EpisodeSummary)
+    # 0: from a run of a version that did not record it
+    picked = _pick({"num_robots": 0} | dict(values), EpisodeSummary)
     picked["outcome"] = Outcome(picked["outcome"])
     return EpisodeRecord(values["time_s"], values["learner_steps"], EpisodeSummary(**picked))
 
@@ -92,9 +95,13 @@ def _evaluation(values: Mapping[str, Any]) -> EvaluationRecord:
     )
 
 
-def _objects(text: bytes) -> Iterator[dict[str, Any]]:
-    """The whole lines that are JSON objects; others (torn, zeroed by a crash) are skipped."""
-    for line in text.split(b"\n")[:-1]:
+def json_objects(text: bytes, *, from_end: bool = False) -> Iterator[dict[str, Any]]:
+    """The whole lines that are JSON objects; others (torn, zeroed by a crash) are skipped.
+
+    from_end: the last one first.
+    """
+    lines = text.split(b"\n")[:-1]
+    for line in reversed(lines) if from_end else lines:
         try:
             values = json.loads(line)
         except ValueError:
@@ -104,10 +111,12 @@ def _objects(text: bytes) -> Iterator[dict[str, Any]]:
 
 
 def _read(path: Path, parse: Callable[[Mapping[str, Any]], Record]) -> list[Record]:
-    if not path.exists():
-        return []
+    return _parsed(path, path.read_bytes(), parse) if path.exists() else []
+
+
+def _parsed(path: Path, text: bytes, parse: Callable[[Mapping[str, Any]], Record]) -> list[Record]:
     try:
-        return [parse(values) for values in _objects(path.read_bytes())]
+        return [parse(values) for values in json_objects(text)]
     except (KeyError, TypeError, ValueError) as error:
         raise RunDirectoryError(f"{path} is not of this version of mrcdrl: {error!r}") from error
 
@@ -120,6 +129,18 @@ def read_episodes(run_dir: Path) -> list[EpisodeRecord]:
     return _read(run_dir / EPISODES, _episode)
 
 
+def read_last_episodes(run_dir: Path) -> list[EpisodeRecord]:
+    """The latest episodes, some hundreds; errors are those of `read_episodes`."""
+    path = run_dir / EPISODES
+    if not path.exists():
+        return []
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _LATEST_BYTES))
+        lines = file.read()
+    whole = lines if len(lines) < _LATEST_BYTES else lines.partition(b"\n")[2]
+    return _parsed(path, whole, _episode)
+
+
 def read_evaluations(run_dir: Path) -> list[EvaluationRecord]:
     """Every evaluation of a run, in the order reported; [] when there is no file.
 
@@ -130,19 +151,35 @@ def read_evaluations(run_dir: Path) -> list[EvaluationRecord]:
 
 def read_last_metrics(run_dir: Path) -> dict[str, Any]:
     """The last whole line of the metrics; {} when there is none."""
+    return next(iter(read_latest_metrics(run_dir, 1)), {})
+
+
+def read_latest_metrics(run_dir: Path, num: int) -> list[dict[str, Any]]:
+    """The last whole lines of the metrics: at most `num`, and at least one where there is one."""
     path = run_dir / METRICS
     if not path.exists():
-        return {}
+        return []
     size = path.stat().st_size
     tail, objects = _TAIL_BYTES, list[dict[str, Any]]()
     with path.open("rb") as file:
         while not objects:  # a run of a thousand actors has lines of a megabyte
             file.seek(max(0, size - tail))
-            objects = list(_objects(file.read()))
+            objects = list(islice(json_objects(file.read(), from_end=True), num))
             if tail >= size:
                 break
             tail *= 4
-    return objects[-1] if objects else {}
+    return objects[::-1]
+
+
+def by_service(metrics: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, float]]:
+    """The numbers of each service in a line of metrics, named ROLE/WORKER/METRIC there."""
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    for name, value in metrics.items():
+        role, _, rest = name.partition("/")
+        worker, _, metric = rest.partition("/")
+        if metric and isinstance(value, int | float):
+            found.setdefault((role, worker), {})[metric] = float(value)
+    return found
 
 
 def cut_torn_line(path: Path) -> None:

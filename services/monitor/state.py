@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Any
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.metrics import M, of_kind, read
@@ -31,6 +32,7 @@ ROLES = ("actor", "replay", "learner", "evaluator", "status")
 WITHOUT_METRICS = ("status",)  # roles that announce themselves and publish nothing
 COUNTERS = of_kind("pace")  # an actor's start at 0 with it; the others' are kept with the run
 SHARES = of_kind("share")
+HISTOGRAMS = of_kind("histogram")
 STALENESS = ("versions", "s")
 INCARNATION = "incarnation"  # a text in Stats
 HISTORY_PERIOD = 10  # episodes between two points of the success curve
@@ -52,6 +54,7 @@ class Service:
     rates: dict[str, Rate] = field(default_factory=dict)
     shares: dict[str, Share] = field(default_factory=dict)
     staleness: dict[str, SpreadWindow] = field(default_factory=dict)  # of its weights, by unit
+    histograms: dict[str, float] = field(default_factory=dict)  # the latest; not in every report
     former: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_FORMER))
     """Incarnations before the present one."""
     namesakes: int = 0
@@ -141,6 +144,8 @@ class RunState:
             service.former.append(before)
         service.alive, service.heard_s = True, now
         service.metrics, service.text = dict(stats.metrics), dict(stats.text)
+        binned = {n: stats.metrics[n] for n in HISTOGRAMS.get(stats.role, ()) if n in stats.metrics}
+        service.histograms = binned or service.histograms
         for name in COUNTERS.get(stats.role, ()):
             if name in stats.metrics:
                 earlier = self._counted.get((stats.id, name), 0.0)  # of actors only
@@ -217,6 +222,16 @@ class RunState:
             self._collected[name] += counted.get(name, 0)
         self._before = counted
 
+    def restore_metrics(self, metrics: Mapping[str, Any]) -> None:
+        """Add what the run had counted, by the last line of its metrics."""
+        names = [name.split("/") for name in metrics if name.startswith("actor/")]
+        by_actor = {
+            (actor, name): float(metrics[f"actor/{actor}/{name}"])
+            for _, actor, name in names
+            if name in COUNTERS["actor"]
+        }
+        self.restore_counted(metrics, by_actor)
+
     def _service(self, role: str, service_id: str) -> Service:
         """The service of that name; one that is kept nowhere if there are too many."""
         key, new = (role, service_id), Service(role, service_id)
@@ -229,6 +244,11 @@ class RunState:
     def knows(self, role: str, service_id: str) -> bool:
         """Whether a service of that name is, or was, up."""
         return (role, service_id) in self._services
+
+    @property
+    def by_arrival(self) -> list[Service]:
+        """Every service ever seen, in the order in which they came."""
+        return list(self._services.values())
 
     @property
     def services(self) -> list[Service]:

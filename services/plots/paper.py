@@ -56,7 +56,7 @@ class Contender:
 
 
 def arenas(
-    images: Sequence[UInt8Array], titles: Sequence[str], out: Path, *, obstacles: bool
+    images: Sequence[UInt8Array], titles: Sequence[str], *outs: Path, obstacles: bool
 ) -> None:
     """Plot arenas side by side (Fig. 1); images: BGR [S, S, 3]; obstacles: whether any has some."""
     figure, panels = _panels(1, len(images), 3.6)
@@ -64,10 +64,10 @@ def arenas(
         axes.imshow(image[..., ::-1])
         axes.set_title(title, fontsize=10)
     explain_arena(figure, obstacles=obstacles)
-    save(figure, out)
+    save(figure, *outs)
 
 
-def sight(seen: Sight, config: ArenaConfig, out: Path) -> None:
+def sight(seen: Sight, config: ArenaConfig, *outs: Path) -> None:
     """Plot how a robot's image is made, and what each robot sees (Fig. 3).
 
     (a) the arena's intensities with the rectangle around one robot, zeros beyond the border; (b)
@@ -88,21 +88,24 @@ def sight(seen: Sight, config: ArenaConfig, out: Path) -> None:
             axes.imshow(image, cmap="gray", vmin=0, vmax=255)
             axes.set(xticks=[], yticks=[])
         row[0].set_ylabel(f"robot {robot + 1}", fontsize=8)
-    save(figure, out)
+    save(figure, *outs)
 
 
-def comparison(rows: Sequence[Contender], config: ArenaConfig, out: Path) -> None:
-    """Plot several policies from the same starts (Fig. 10): a row each, a column for each start."""
-    figure, panels = _panels(len(rows), len(rows[0].episodes), 3.1)
+def comparison(rows: Sequence[Contender], config: ArenaConfig, *outs: Path) -> None:
+    """Plot several policies from the same starts (Fig. 10): a row each, a column for each start.
+
+    A row may have fewer episodes than others; its last panels stay empty.
+    """
+    figure, panels = _panels(len(rows), max(len(row.episodes) for row in rows), 3.1)
     for row, contender in zip(panels, rows, strict=True):
-        for axes, episode in zip(row, contender.episodes, strict=True):
+        for axes, episode in zip(row, contender.episodes, strict=False):
             draw_paths(axes, episode, config)
         row[0].set_axis_on()  # for its label alone
         row[0].set(xticks=[], yticks=[])
         row[0].spines[:].set_visible(False)
         row[0].set_ylabel(fill(contender.name, _ROW_NAME), fontsize=9, fontweight="bold")
     explain_paths(figure, [episode for row in rows for episode in row.episodes])
-    save(figure, out)
+    save(figure, *outs)
 
 
 def curves(run_dirs: Sequence[Path], out: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from mrcdrl.common.config import to_toml
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
 from mrcdrl.common.sync.claim import claim_shard
-from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.sync.stats import StatsReporter, serve_statistics
 from mrcdrl.common.transport import Session
 from mrcdrl.services.replay.leases import LeaseTable, answer_leases
 from mrcdrl.services.replay.limiter import RateLimiter
@@ -51,13 +51,14 @@ def main(argv: Sequence[str]) -> int:
         _LOG.info("serving %s, %d of %d transitions", serving.run, len(table), table.capacity)
         leases = LeaseTable(config.exploration.lease_s, config.exploration.slots, time.monotonic())
         try:
-            while not stop.is_set() and service.healthy:
-                serve_config(_TICK_S)
-                if lease_requests is not None:
-                    answer_leases(lease_requests, leases)
-                if service.accepting:
-                    reporter.worked()
-                reporter.publish_if_due(service.metrics)
+            with serve_statistics(serving.transport, "replay", serving.run, reporter):
+                while not stop.is_set() and service.healthy:
+                    serve_config(_TICK_S)
+                    if lease_requests is not None:
+                        answer_leases(lease_requests, leases)
+                    if service.accepting:
+                        reporter.worked()
+                    reporter.publish_if_due(service.metrics)
         finally:
             service.stop()
             if log is not None:

@@ -15,8 +15,9 @@ import numpy as np
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.returns import largest_n_step_return, largest_return
+from mrcdrl.common.config.schema import MOST_ACTIONS
 from mrcdrl.common.errors import ConfigError, WireError
-from mrcdrl.common.messages.fitting import check_returns
+from mrcdrl.common.messages.fitting import check_actions, check_returns
 from mrcdrl.common.messages.trajectory import Chunk, Float32Array, Int64Array, Samples, UInt8Array
 from mrcdrl.services.replay.capacity import TAILS_PER_CHUNK, capacity_of
 from mrcdrl.services.replay.sampler import Sampler, make_sampler
@@ -43,8 +44,9 @@ class Table:
     window is stack + n_step records. chunk_length: transitions in most chunks; with many chunks
     that are shorter, or that no later chunk continues, the table holds less than its capacity.
     record_bytes: length of one record. sampler: of the same capacity, for this table alone.
-    largest_return: a chunk with a greater n-step return is refused. largest_error: greater absolute
-    TD errors count as this one. All memory is allocated, and touched, at once.
+    num_actions, largest_return: a chunk with another action or a greater n-step return is refused.
+    largest_error: greater absolute TD errors count as this one. All memory is allocated, and
+    touched, at once.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class Table:
         record_bytes: int,
         sampler: Sampler,
         *,
+        num_actions: int = MOST_ACTIONS,
         largest_return: float = math.inf,
         largest_error: float = math.inf,
     ) -> None:
@@ -91,6 +94,7 @@ class Table:
         self._next_key = 0
         self._next_row = 0
         self._sampler = sampler
+        self._num_actions = num_actions
         self._largest_return = largest_return
         self._largest_error = np.float32(largest_error)
 
@@ -110,6 +114,7 @@ class Table:
             chunk_length=1 if config.run.turn_size else config.actor.chunk_length,
             record_bytes=config.arena.record_bytes if record_bytes is None else record_bytes,
             sampler=make_sampler(config.replay, capacity),
+            num_actions=config.arena.action_count,
             largest_return=largest_n_step_return(config),
             largest_error=_LARGEST_ERRORS * largest_return(config),
         )
@@ -176,6 +181,7 @@ class Table:
                 f"records of {record_bytes} bytes, {tail} more than transitions, where "
                 f"{self._rows.shape[1]} and {self._window - 1} are due: another arena or agent?"
             )
+        check_actions(chunk, self._num_actions)
         check_returns(chunk, self._n_step, self._largest_return)
         if len(chunk) > self._capacity:
             raise WireError(f"{len(chunk)} transitions exceed the capacity {self._capacity}")

@@ -8,6 +8,7 @@ from mrcdrl.common.config import load_transport
 from mrcdrl.common.config.arguments import Parser, add_config_flags, add_transport_flag, overrides
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import STOP_DEADLINE_S, StopSignal
+from mrcdrl.common.sync.stats import serve_statistics
 from mrcdrl.common.transport import ROUTER_FILE, AccessLog, Session
 
 _TICK_S = 1.0
@@ -29,6 +30,7 @@ def main(argv: Sequence[str]) -> int:
         if transport.key:
             owned.enter_context(AccessLog())
         owned.enter_context(Session(transport, router_file=arguments.config))
+        owned.enter_context(serve_statistics(transport, "router"))
         while not stop.wait(_TICK_S):
             heartbeat.worked()
             heartbeat.beat()

@@ -8,29 +8,28 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.arguments import Parser, add_config_flags
-from mrcdrl.common.errors import DeadlineError, RunDirectoryError, UnreachableError
+from mrcdrl.common.errors import DeadlineError, UnreachableError
 from mrcdrl.common.runtime.files import METRICS
 from mrcdrl.common.runtime.heartbeat import Heartbeat
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.runs import LATEST, is_run, run_path
-from mrcdrl.common.runtime.versions import VERSIONED
-from mrcdrl.common.sync.joining import ENDPOINT_FILE, Joining, fetch_config, joining_parser
+from mrcdrl.common.sync.joining import Joining, fetch_config, joining_parser
 from mrcdrl.common.transport import Session
-from mrcdrl.services.monitor.bottleneck import bottleneck
 from mrcdrl.services.monitor.display import Show, at_most_every, display
 from mrcdrl.services.monitor.follower import Follower
-from mrcdrl.services.monitor.phase import progress
-from mrcdrl.services.monitor.recorder import Recorder, flat_metrics, restore
-from mrcdrl.services.monitor.records import finite, read_last_metrics
+from mrcdrl.services.monitor.prometheus import serve_run
+from mrcdrl.services.monitor.recall import recall
+from mrcdrl.services.monitor.recorder import Recorder
+from mrcdrl.services.monitor.records import read_last_metrics
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.screen import Screen, clock
 from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.status import status
 from mrcdrl.services.monitor.stopping import StoppingRule, stopped
 from mrcdrl.services.monitor.watching import Watching
 
@@ -40,7 +39,6 @@ _JSON_PERIOD_S = 1.0
 _WAIT_S = 30.0  # of a watcher or recorder, for the run to come up
 _RETRY_S = 0.2
 _KEYS = "Ctrl-C ends this view; the run goes on"
-_FRESH_S = 10.0  # records are of a run that is up if they are no older; one comes every second
 
 
 def main(argv: Sequence[str]) -> int:
@@ -58,6 +56,10 @@ def main(argv: Sequence[str]) -> int:
         else:
             lasted_s = recall(joining.run_dir, state, rule)
         follower = Follower(session, joining.keys, state, recorder, rule, lasted_s)
+        if arguments.watch or arguments.record:
+            owned.enter_context(
+                serve_run(joining.transport, follower, state, joining.run_dir, "status")
+            )
         if not (arguments.watch or arguments.record):
             listen(follower, Heartbeat(None), stop, lambda: None, until_s=_LISTEN_S)
             print_once(state, follower.now, joining.run_dir, arguments.json)
@@ -139,24 +141,6 @@ def last_seen(run_dir: Path) -> str:
     return f"last seen {at}, {clock(lasted_s)} after it began"
 
 
-def recall(run_dir: Path, state: RunState, rule: StoppingRule) -> float:
-    """Fold in what the run has recorded on this machine; the seconds it has lasted.
-
-    Where nothing is being recorded, the state says from when on it counts.
-    """
-    try:
-        if time.time() - (run_dir / METRICS).stat().st_mtime < _FRESH_S:
-            lasted_s = restore(run_dir, state, rule)
-            endpoint = run_dir / ENDPOINT_FILE  # written when `mrcdrl train` starts the run
-            up_s = time.time() - endpoint.stat().st_mtime if endpoint.exists() else None
-            state.resumed_at_s = None if up_s is None else max(0.0, lasted_s - up_s)
-            return lasted_s
-    except (OSError, RunDirectoryError):
-        pass
-    state.since, state.resumed_at_s = "since status started", None
-    return 0.0
-
-
 def parser() -> Parser:
     """The command's flags."""
     made = joining_parser(
@@ -199,38 +183,3 @@ def print_once(state: RunState, now: float, run_dir: Path, as_json: bool) -> Non
     else:
         console = Console()
         console.print(Screen(state, now, run_dir), height=console.height - 1)
-
-
-def status(state: RunState, now: float) -> dict[str, Any]:
-    """The processes, the bottleneck, and all that metrics.jsonl records of a second."""
-    last = state.last_evaluation
-    figures = flat_metrics(state, now).items()
-    doing = progress(state)
-    values = {
-        "time_since": state.since or "the run began",
-        "phase": doing.phase,
-        "evaluating_version": doing.evaluating,
-        "limited_by": bottleneck(state).replace("\N{NO-BREAK SPACE}", " "),
-        "services": [
-            {
-                "role": s.role,
-                "id": s.id,
-                "alive": s.alive,
-                "silent_s": round(s.silent_s(now), 6),
-                "slot": s.slot,
-                "compiling": s.compiling,
-                "versions": {name: s.text[name] for name in VERSIONED if name in s.text},
-            }
-            for s in state.services
-        ],
-        "replay_size": state.replay_size,
-        "replay_capacity": state.replay_capacity,
-        "success_rate": last.evaluation.success_rate if last else None,
-        "success_by_robots": {
-            str(number): record.evaluation.success_rate
-            for number, record in sorted(state.last_by_robots.items())
-        },
-        "evaluated_version": last.evaluation.weights_version if last else None,
-        **{name: None if value is None else round(value, 6) for name, value in figures},
-    }
-    return {name: finite(value) for name, value in values.items()}

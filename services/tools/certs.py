@@ -10,7 +10,7 @@ from mrcdrl.common.config.arguments import Parser, whole_number
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.completion import completed_by
 
-ROLES = ("router", "replay", "learner", "actor", "evaluator", "status", "robot")
+ROLES = ("router", "replay", "learner", "actor", "evaluator", "status", "viewer", "robot")
 HOSTS = ("localhost", "127.0.0.1", "::1", "router")
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 
+from mrcdrl.common.arena import looked_up
 from mrcdrl.common.config import DEFAULT_PRESET, load_config, to_toml
 from mrcdrl.common.config.arguments import (
     Parser,
@@ -31,7 +32,7 @@ def main(argv: Sequence[str]) -> int:
         facts = explain(arguments.explain, source, given)
         print(json.dumps(facts) if arguments.json else explained(facts))
         return 0
-    config = load_config(source, given)
+    config = looked_up(load_config(source, given))
     print(config.model_dump_json() if arguments.json else to_toml(config))
     return 0
 

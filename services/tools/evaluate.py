@@ -13,10 +13,12 @@ import time
 from collections.abc import Sequence
 
 from mrcdrl.common.arena import test_starts
+from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Evaluation
 from mrcdrl.services.evaluator.navigation import Navigation, navigation, navigation_table
 from mrcdrl.services.evaluator.score import evaluation
 from mrcdrl.services.evaluator.trial import EpisodeResult, play
+from mrcdrl.services.evaluator.values import StartValues, start_values
 from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.failure_summary import as_json, failure_table, summarize
 from mrcdrl.services.tools.failures import Failure
@@ -35,7 +37,15 @@ def main(argv: Sequence[str]) -> int:
 
 
 def told(evaluated: Subject, arguments: argparse.Namespace) -> str:
-    """Evaluate the subject; the result as text, or as a line of JSON."""
+    """Evaluate the subject; the result as text, or as a line of JSON.
+
+    Raises ConfigError for a controller whose values are asked for: it has none.
+    """
+    if arguments.values and evaluated.policy is None:
+        raise ConfigError("--values compares a network's values: give weights, not --controller")
+    arena = evaluated.config.arena
+    if arena.is_custom and arguments.failures is not None:
+        raise ConfigError("--failures tells robots and walls apart: not with a custom world")
     with Progress() as progress:
         result, measures, episodes = evaluate(
             evaluated,
@@ -51,8 +61,21 @@ def told(evaluated: Subject, arguments: argparse.Namespace) -> str:
             failures = failures_of(
                 evaluated, episodes, arguments.seed, lambda: done(next(replayed))
             )
-    values = dataclasses.asdict(result) | {"navigation": dataclasses.asdict(measures)}
-    text = table(result, evaluated) + navigation_table(measures)
+        compared: StartValues | None = None
+        if arguments.values and evaluated.policy is not None:
+            starts = test_starts(arena, arguments.episodes, arguments.seed)
+            done = progress.stage("episodes by training's rules", len(starts))
+            compared = start_values(evaluated.config, evaluated.policy, starts, done)
+    values = dataclasses.asdict(result) | {
+        "outcomes": "".join(episode.outcome[0] for episode in episodes),
+    }
+    text = table(result, evaluated)
+    if measures is not None:
+        values["navigation"] = dataclasses.asdict(measures)
+        text += navigation_table(measures)
+    if compared is not None:
+        values["values"] = dataclasses.asdict(compared)
+        text += values_table(compared)
     if arguments.failures is not None:
         summary = summarize(failures, arguments.episodes)
         values["failures"] = as_json(failures, summary, arguments.failures)
@@ -67,8 +90,8 @@ def evaluate(
     report: Done,
     *,
     keep_failed_paths: bool = False,
-) -> tuple[Evaluation, Navigation, list[EpisodeResult]]:
-    """The paper's measures, those of navigation, and the episodes.
+) -> tuple[Evaluation, Navigation | None, list[EpisodeResult]]:
+    """The paper's measures, those of navigation except in a custom world, and the episodes.
 
     report: called with the number of episodes finished.
     """
@@ -94,24 +117,41 @@ def evaluate(
         seed=seed,
         wall_s=time.monotonic() - began_s,
     )
+    if evaluated.config.arena.is_custom:
+        return result, None, results
     outcomes, frames = [r.outcome for r in results], [r.frames for r in results]
     return result, navigation(outcomes, frames, [r.journey for r in results]), results
+
+
+def values_table(compared: StartValues) -> str:
+    """Format the comparison of values with returns for a terminal."""
+    low, high = compared.interval
+    return f"""at the start, by training's rules and without exploration, in rewards
+  value           {compared.expected:8.2f}
+  return          {compared.realised:8.2f}   (discounted)
+  overestimation  {compared.overestimation:8.2f}   (95 % interval {low:.2f} to {high:.2f})
+"""
 
 
 def table(result: Evaluation, evaluated: Subject) -> str:
     """Format the result for a terminal."""
     low, high = result.success_interval
     epsilon = evaluated.config.evaluator.epsilon
+    custom = evaluated.config.arena.is_custom
+    players = "agents" if custom else "robots"
+    failure = "failure  " if custom else "collision"
+    score = f"  return     {result.mean_score:7.2f}   (a sum, mean over agents)\n" if custom else ""
     who = (
         f"controller {evaluated.controller}, which sees the true state"
         if evaluated.controller
         else f"weights of learner step {result.learner_step}, from images alone"
     )
     return f"""{who}
-{result.num_robots} robots, {result.episodes} episodes, epsilon {epsilon:g}
+{result.num_robots} {players}, {result.episodes} episodes, epsilon {epsilon:g}
   success    {result.success_rate:7.2%}   (95 % interval {low:.2%} to {high:.2%})
-  collision  {result.collision_rate:7.2%}
+  {failure}  {result.collision_rate:7.2%}
   time-out   {result.timeout_rate:7.2%}
+{score}\
   successes per 100: max {result.max_per_100:.0f}, average {result.mean_per_100:.2f}, \
 variance {result.variance_per_100:.2f}
 """

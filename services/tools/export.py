@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mrcdrl.common.arena import ArenaBatch, make_codec
+from mrcdrl.common.arena import make_arenas, make_codec
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import CheckpointError, ConfigError
 from mrcdrl.common.model.policy import FrameStack, Policy
@@ -88,7 +88,7 @@ def real_states(config: Config, policy: Policy, count: int) -> np.ndarray:
     """States uint8 [count, S, V, V] of episodes played by the policy with epsilon 0.3."""
     arena = config.arena.with_robots(config.arena.num_robots)
     codec, rng = make_codec(arena), np.random.default_rng(0)
-    arenas = ArenaBatch(arena, [rng])
+    arenas = make_arenas(arena, [rng], [0])
     frames = FrameStack(arena.num_robots, arena.stack, arena.view_px)
     seen: list[np.ndarray] = []
     while sum(map(len, seen)) < count:

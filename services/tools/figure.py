@@ -3,6 +3,7 @@
 import argparse
 import copy
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from mrcdrl.services.plots.paper import (
     sight,
 )
 from mrcdrl.services.tools import flags
-from mrcdrl.services.tools.progress import Progress
+from mrcdrl.services.tools.progress import Done, Progress
 from mrcdrl.services.tools.subject import Subject, config_without_weights, controlled, subject
 
 _ARENA_PX = 900
@@ -52,22 +53,32 @@ def _arena(arguments: argparse.Namespace, _progress: Progress) -> None:
     """Draw a test start in the arena of each subject, or of --config if there is none."""
     named = [shown.config for shown in _subjects(arguments)] or [config_without_weights(arguments)]
     configs = [one.arena for config in named for one in config.each_number()]
+    draw_arenas(configs, arguments.seed, arguments.out)
+
+
+def draw_arenas(configs: Sequence[ArenaConfig], seed: int, *outs: Path) -> None:
+    """Draw the first test start of each arena (Fig. 1)."""
     images, obstacles = [], False
     for config in configs:
-        (start,) = test_starts(config, 1, arguments.seed)
+        (start,) = test_starts(config, 1, seed)
         obstacles |= len(start.obstacles) > 0
         scene = Scene(start.robots, start.targets, start.obstacles)
         images.append(render_arena(scene, config, _ARENA_PX, smooth=True))
     titles = [f"{c.num_robots} robot{'s' * (c.num_robots != 1)}" for c in configs]
-    arenas(images, titles, arguments.out, obstacles=obstacles)
+    arenas(images, titles, *outs, obstacles=obstacles)
 
 
 def _views(arguments: argparse.Namespace, progress: Progress) -> None:
     """Show what the lowermost robot sees (Fig. 3)."""
-    shown = _one(arguments)
-    (episode,) = shown.episodes(1, arguments.seed, progress.stage("the episode"))
+    shown, done = _one(arguments), progress.stage("the episode")
+    draw_views(shown, arguments.seed, arguments.frame, done, arguments.out)
+
+
+def draw_views(shown: Subject, seed: int, at_frame: int, report: Done, *outs: Path) -> None:
+    """Show what the lowermost robot sees in that frame of an episode (Fig. 3)."""
+    (episode,) = shown.episodes(1, seed, report)
     config = shown.config.arena.with_robots(episode.robots.shape[1])
-    frame = min(arguments.frame, episode.frames)
+    frame = min(at_frame, episode.frames)
     before = range(frame - config.stack + 1, frame + 1)
     targets, obstacles = episode.targets, episode.obstacles
     scenes = [Scene(episode.robots[max(0, at)], targets, obstacles) for at in before]
@@ -80,7 +91,7 @@ def _views(arguments: argparse.Namespace, progress: Progress) -> None:
         view=literal_views(scenes[-1], config)[robot],
         states=states,
     )
-    sight(seen, config, arguments.out)
+    sight(seen, config, *outs)
 
 
 def _trajectories(arguments: argparse.Namespace, progress: Progress) -> None:
@@ -88,7 +99,7 @@ def _trajectories(arguments: argparse.Namespace, progress: Progress) -> None:
     num = arguments.episodes or 12
     episodes = shown.episodes(num, arguments.seed, progress.stage("episodes", num))
     progress.stage(arguments.out.name)
-    trajectories(_paths(episodes), shown.config.arena, arguments.out)
+    trajectories(paths_of(episodes), shown.config.arena, arguments.out)
 
 
 def _comparison(arguments: argparse.Namespace, progress: Progress) -> None:
@@ -107,7 +118,7 @@ def _comparison(arguments: argparse.Namespace, progress: Progress) -> None:
         done = progress.stage(f"episodes of {name}", num)
         episodes = shown.episodes(num, arguments.seed, done)
         won = sum(episode.outcome is Outcome.SUCCESS for episode in episodes)
-        rows.append(Contender(f"{name}: {won} of {len(episodes)}", _paths(episodes)))
+        rows.append(Contender(f"{name}: {won} of {len(episodes)}", paths_of(episodes)))
     progress.stage(arguments.out.name)
     comparison(rows, world, arguments.out)
 
@@ -150,7 +161,8 @@ def _names(arguments: argparse.Namespace) -> list[str]:
     return [*(path.resolve().stem for path in paths), *arguments.controller]
 
 
-def _paths(episodes: Sequence[EpisodeResult]) -> list[Path2D]:
+def paths_of(episodes: Sequence[EpisodeResult]) -> list[Path2D]:
+    """The paths of episodes that were kept, as they are plotted."""
     return [Path2D(e.robots, e.targets, e.obstacles, e.outcome) for e in episodes]
 
 

@@ -46,6 +46,9 @@ def evaluate() -> Parser:
         help="describe the first N failures (without N: all), and what share failed in which way",
     )
     made.add_argument(
+        "--values", action="store_true", help="also compare action values with returns"
+    )
+    made.add_argument(
         "--json", action="store_true", help="print JSON, a line for each number of robots"
     )
     add_config_flags(made, _SHOWN)

@@ -1,12 +1,14 @@
-"""`mrcdrl report RUN`: write the plots of a run, as .png and .svg, and evaluation.mp4."""
+"""`mrcdrl report RUN`: write the plots of a run, as .png and .svg, and films."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from mrcdrl.common.runtime.files import FILM, MOVING_PICTURE
 from mrcdrl.common.runtime.runs import find_run
-from mrcdrl.services.plots.figures import Path2D, training_curve, trajectories
+from mrcdrl.services.plots.figures import training_curve, trajectories
 from mrcdrl.services.plots.paper import SUFFIXES
 from mrcdrl.services.tools import flags
+from mrcdrl.services.tools.figure import paths_of
 from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.render import write_episodes
 from mrcdrl.services.tools.subject import subject
@@ -30,17 +32,24 @@ def main(argv: Sequence[str]) -> int:
 
 
 def draw_episodes(run_dir: Path, progress: Progress) -> None:
-    """Plot and film episodes of the best weights; CheckpointError if the run has no weights."""
+    """Plot and film episodes of the best weights; CheckpointError if the run has no weights.
+
+    A custom world has no poses to draw.
+    """
     shown = subject(flags.evaluate().parse_args([str(run_dir)]))
     arena = shown.config.arena
+    if arena.is_custom:
+        return
     results = shown.episodes(_EPISODES, _SEED, progress.stage("episodes", _EPISODES))
-    paths = [Path2D(r.robots, r.targets, r.obstacles, r.outcome) for r in results]
     files = plots(run_dir, "trajectories")
     progress.stage("trajectories.png")
-    trajectories(paths, arena, *files)
-    film, note = run_dir / "evaluation.mp4", f"the first {_FILMED} of {_EPISODES} episodes"
+    trajectories(paths_of(results), arena, *files)
+    # Films come last: whoever ends this command before its end then knows which file is cut off.
+    moving, film = run_dir / MOVING_PICTURE, run_dir / FILM
+    write_episodes(moving, arena, results[:1], progress, f"the first of {_EPISODES} episodes")
+    note = f"the first {_FILMED} of {_EPISODES} episodes"
     write_episodes(film, arena, results[:_FILMED], progress, note)
-    print(*files, film, sep="\n")
+    print(*files, moving, film, sep="\n")
 
 
 def plots(run_dir: Path, name: str) -> list[Path]:

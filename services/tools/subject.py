@@ -10,13 +10,13 @@ from typing import Self
 import numpy as np
 import torch
 
-from mrcdrl.common.arena import make_codec, test_starts
+from mrcdrl.common.arena import looked_up, make_codec, test_starts
 from mrcdrl.common.arena.controllers import check_controller, make_controller
 from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
 from mrcdrl.common.config.arguments import overrides
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Weights
-from mrcdrl.common.model.policy import Policy
+from mrcdrl.common.model.policy import Policy, averaged_symmetries
 from mrcdrl.common.model.saved_policy import config_beside, policy_of, read_saved, weights_path
 from mrcdrl.common.runtime.runs import find_weights
 from mrcdrl.services.evaluator.trial import (
@@ -54,14 +54,23 @@ class Subject:
 
     def each_number(self) -> list[Self]:
         """The subject with each number of robots alone, in rising order."""
-        return [replace(self, config=config) for config in self.config.each_number()]
+        return [self._playing(config) for config in self.config.each_number()]
+
+    def _playing(self, config: Config) -> Self:
+        policy = self.policy and self.policy.averaging(averaged_symmetries(config))
+        return replace(self, config=config, policy=policy)
 
     def episodes(self, num: int, seed: int, report: Done) -> list[EpisodeResult]:
         """Play the paper's test from `num` starts, keeping the robots' paths.
 
         Where there are several numbers of robots, they take turns, the greatest first. report:
-        called with the number of episodes finished.
+        called with the number of episodes finished. Raises ConfigError for a custom world.
         """
+        if self.config.arena.is_custom:
+            raise ConfigError(
+                "films and paths are drawn from the poses of the paper's arena: not yet with a "
+                "custom world, arena.env"
+            )
         parts = self.each_number()[::-1]
         played: dict[int, EpisodeResult] = {}
         for place, part in enumerate(parts):
@@ -91,11 +100,16 @@ def subject(arguments: argparse.Namespace) -> Subject:
         return controlled(arguments.controller, config_without_weights(arguments))
     path = weights_path(find_weights(arguments.weights, arguments.run_dir))
     own = config_beside(path)
-    config = load_config(arguments.config or own, overrides(arguments))
+    config = _known(load_config(arguments.config or own, overrides(arguments)))
     _say_other_robots(path, own, config)
     torch.set_num_threads(config.evaluator.threads)
     weights = read_saved(path)
     return Subject(config, policy_of(path, weights, config), None, weights)
+
+
+def _known(config: Config) -> Config:
+    """The configuration with the numbers of a custom world, which it is asked where they lack."""
+    return config if config.arena.num_actions else looked_up(config)
 
 
 def _say_other_robots(path: Path, own: str, config: Config) -> None:
@@ -125,4 +139,10 @@ def always(report: Done) -> Callable[[int], bool]:
 
 def controlled(name: str, config: Config) -> Subject:
     """The controller of this name as a subject; raises ConfigError for an unknown one."""
-    return Subject(config, None, check_controller(name), Weights.of(0, 0, 0, b""))
+    check = check_controller(name)
+    if config.arena.is_custom:
+        raise ConfigError(
+            "--controller sees the true state of the paper's arena: not with a custom world, "
+            "arena.env"
+        )
+    return Subject(config, None, check, Weights.of(0, 0, 0, b""))

@@ -8,16 +8,15 @@ import shlex
 from pathlib import Path
 
 from mrcdrl.common.errors import RunDirectoryError
-from mrcdrl.common.runtime.files import BEST_WEIGHTS
+from mrcdrl.common.runtime.files import BEST_WEIGHTS, FILM, PICTURES
 from mrcdrl.common.runtime.files import reason as failure
 from mrcdrl.common.runtime.runs import runs_folder
 from mrcdrl.services.monitor.recorder import SUMMARY
 from mrcdrl.services.monitor.records import read_last_metrics
 from mrcdrl.services.monitor.run_info import best_evaluation
 from mrcdrl.services.monitor.stopping import rule_of
-from mrcdrl.services.train.launcher import FILM
 
-_FILES = (SUMMARY, str(BEST_WEIGHTS), "training.png", "trajectories.png", FILM)
+_FILES = (SUMMARY, str(BEST_WEIGHTS), *PICTURES, FILM)
 
 
 def ending(run_dir: Path, reason: str) -> str:
@@ -35,6 +34,7 @@ def ending(run_dir: Path, reason: str) -> str:
             ("next", f"mrcdrl evaluate {word}"),
             ("", f"mrcdrl render {word} --out {shlex.quote(run_dir.name)}.mp4"),
         ]
+    lines.append(("" if lines[-1][0] == "" else "next", f"mrcdrl web {word}"))
     resume = f"mrcdrl train --resume {word}{_other_limit(reason)}"
     lines.append(("" if lines[-1][0] == "" else "next", resume))
     files = [name for name in _FILES if (run_dir / name).is_file()]

@@ -13,7 +13,6 @@ _SHOWN = (  # in the short help
     "run.target_success_rate",
     "run.actors",
     "agent.kind",
-    "arena.target_layout",
     "learner.batch_size",
     "learner.device",
 )
@@ -35,6 +34,18 @@ def parser() -> Parser:
         "--dry-run", action="store_true", help="say what the run would be and take, and end"
     )
     made.add_argument("--json", action="store_true", help="print the summary as JSON at the end")
+    made.add_argument(
+        "--no-plots",
+        action="store_false",
+        dest="plots",
+        help="no plots and video at the end",
+    )
+    made.add_argument(
+        "--no-web",
+        action="store_false",
+        dest="page",
+        help="start no page to watch the run by",
+    )
     add_run_dir(made)
     add_config_flags(made, _SHOWN)
     return made

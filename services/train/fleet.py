@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mrcdrl.common.config import resolved_environment
-from mrcdrl.common.errors import DivergedError, MrcdrlError
+from mrcdrl.common.errors import ConfigError, DivergedError, MrcdrlError
 from mrcdrl.common.runtime.process import ALLOCATOR, last_line, start_service
 from mrcdrl.services.monitor.watching import Watching
 
@@ -77,8 +77,8 @@ class Fleet:
     def watch(self) -> str | None:
         """Restart what crashed; the reason to end the run, if there is one.
 
-        Raises MrcdrlError if a process fails right after its start or repeatedly, or if learning
-        diverged.
+        Raises MrcdrlError if a process fails right after its start or repeatedly, if learning
+        diverged, or for a setting, such as a custom world that breaks the rules: it would again.
         """
         for process in self._processes:
             code = None if process.popen is None else process.popen.poll()
@@ -98,7 +98,7 @@ class Fleet:
             elif (
                 lived_s < _MIN_LIFE_S
                 or process.restarts == _MAX_RESTARTS
-                or code == DivergedError.exit_code
+                or code in (ConfigError.exit_code, DivergedError.exit_code)
             ):
                 raise MrcdrlError(
                     f"{process.worker} failed: {process.last_line()} (log: {process.log_path})"

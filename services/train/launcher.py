@@ -4,6 +4,7 @@ Invariants: what no service could do is refused before anything is written; the 
 without its plots.
 """
 
+import argparse
 import contextlib
 import logging
 import os
@@ -15,18 +16,20 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from mrcdrl.common.arena import test_starts
+from mrcdrl.common.arena import looked_up, test_starts
 from mrcdrl.common.config import DEFAULT_PRESET, Config, TransportConfig, load_config
 from mrcdrl.common.config.arguments import overrides
 from mrcdrl.common.errors import ConfigError, EndpointError
 from mrcdrl.common.runtime.cores import available_cores
 from mrcdrl.common.runtime.extras import require
+from mrcdrl.common.runtime.files import FILM, MOVING_PICTURE
 from mrcdrl.common.runtime.process import COMMAND, DIE_WITH_PARENT, StopSignal
 from mrcdrl.common.runtime.runs import find_run, new_run_path
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.display import display
 from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.prometheus import serve_run
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.run_directory import RunDirectory, default_name
 from mrcdrl.services.monitor.state import RunState
@@ -34,15 +37,17 @@ from mrcdrl.services.monitor.stopping import StoppingRule, stopped
 from mrcdrl.services.monitor.watching import Watching
 from mrcdrl.services.train.flags import parser
 from mrcdrl.services.train.fleet import Fleet
+from mrcdrl.services.train.page import Page
 from mrcdrl.services.train.resuming import check_unfinished
 
 _LOG = logging.getLogger("train")
-FILM = "evaluation.mp4"
 _TICK_S = 0.25
 _PLOTS_S = 300.0
 _JOIN_S = 60.0
+_TRY_S = 1.0
 _ENOUGH_CORES = 4
 _KEYS = "Ctrl-C ends the run"
+_OWN_METRICS = ("--metrics-port", "0")  # of services: the launcher serves those of the whole run
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,8 @@ class Plan:
     open: Callable[[], RunDirectory]  # creates or resumes the run
     dry_run: bool
     json: bool  # print the summary at the end
+    plots: bool  # write plots and video at the end
+    page: bool  # start a page to watch it by
 
 
 def open_run(argv: Sequence[str]) -> RunDirectory:
@@ -74,9 +81,9 @@ def plan_run(argv: Sequence[str]) -> Plan:
         if arguments.name or arguments.config:
             made.error("--resume keeps the run's name and configuration: no --name or --config")
         path = find_run(arguments.resume, arguments.run_dir)
-        return _resumption(path, given, dry_run=arguments.dry_run, json=arguments.json)
+        return _resumption(path, given, arguments)
     preset = arguments.config or DEFAULT_PRESET
-    config = load_config(preset, given)
+    config = looked_up(load_config(preset, given))
     check_possible(config)
     name = arguments.name or default_name(preset, config.arena.num_robots)
     path = new_run_path(name, arguments.run_dir)
@@ -90,19 +97,23 @@ def plan_run(argv: Sequence[str]) -> Plan:
         open=partial(create, path, config),
         dry_run=arguments.dry_run,
         json=arguments.json,
+        plots=arguments.plots,
+        page=arguments.page,
     )
 
 
-def _resumption(path: Path, given: dict[str, str], *, dry_run: bool, json: bool) -> Plan:
+def _resumption(path: Path, given: dict[str, str], flags: argparse.Namespace) -> Plan:
     def check(before: Config, now: Config) -> None:
-        check_possible(now, resumed=True)
+        check_possible(looked_up(now), resumed=True)
         check_unfinished(path, before, now, given)
 
     before, config = RunDirectory.resumed_config(path, given)
     resume = partial(RunDirectory.resume, path, given, check)
-    if dry_run:
+    if flags.dry_run:
         check(before, config)
-    return Plan(path, config, path.name, before, resume, dry_run, json)
+    return Plan(
+        path, config, path.name, before, resume, flags.dry_run, flags.json, flags.plots, flags.page
+    )
 
 
 def check_possible(config: Config, *, resumed: bool = False) -> None:
@@ -112,6 +123,8 @@ def check_possible(config: Config, *, resumed: bool = False) -> None:
     or a package or the initial weights are missing; EndpointError if a port is in use.
     """
     require("torch", "safetensors")
+    if config.run.tracker != "none":
+        require(config.run.tracker)
     for one in config.each_number():
         test_starts(one.arena, 1, config.evaluator.seed)
     initial_weights = "" if resumed else config.learner.initial_weights
@@ -127,11 +140,16 @@ def check_possible(config: Config, *, resumed: bool = False) -> None:
 
 
 def supervise(
-    run: RunDirectory, fleet: Fleet, recorder: Recorder, stop: StopSignal, hurry: StopSignal
+    run: RunDirectory,
+    fleet: Fleet,
+    recorder: Recorder,
+    stop: StopSignal,
+    hurry: StopSignal,
+    page: Page,
 ) -> str:
     """Run all processes until a signal or the stopping rule ends the run; the reason.
 
-    hurry: listens from then on.
+    hurry: listens from then on. page: its address is shown.
     """
     config = run.config
     state, rule = RunState(config), StoppingRule(config.run, config.arena.numbers)
@@ -146,14 +164,17 @@ def supervise(
             rule.go_on()
         start_workers(run, fleet, endpoint)
         # Progress goes to stderr: what is printed on stdout is the result.
-        shown = display(state, run.path, _KEYS, lambda: follower.now, watching, stream=sys.stderr)
-        with shown as show:
+        keys = f"{page.address}  {_KEYS}".lstrip()
+        serving = serve_run(config.transport, follower, state, run.path, "train")
+        shown = display(state, run.path, keys, lambda: follower.now, watching, stream=sys.stderr)
+        with serving, shown as show:
             reason = None
             while reason is None:
                 follower.listen(_TICK_S)
                 for line in fleet.warnings(watching):
                     state.observe_log(line)
                 show()
+                page.check()
                 ended = fleet.watch()
                 if ended:
                     follower.listen(_TICK_S)  # to the learner's last words
@@ -179,7 +200,7 @@ def join(fleet: Fleet, transport: TransportConfig, endpoint: str) -> Session:
     deadline = time.monotonic() + _JOIN_S
     while True:
         try:
-            return Session(connected, open_timeout_s=0.0)
+            return Session(connected, open_timeout_s=_TRY_S)
         except EndpointError:
             fleet.watch()
             if time.monotonic() > deadline:
@@ -191,7 +212,9 @@ def start_replay(run: RunDirectory, fleet: Fleet, endpoints: Sequence[str]) -> N
     ends = [word for endpoint in endpoints for word in ("--listen", endpoint)]
     num_shards = run.config.replay.shards
     if num_shards > 1:
-        fleet.start("router", "router-0", ["--transport", str(run.config_file), *ends])
+        fleet.start(
+            "router", "router-0", ["--transport", str(run.config_file), *_OWN_METRICS, *ends]
+        )
         ends = ["--connect", endpoints[0]]
     for shard in range(num_shards):
         flags = ["--config", str(run.config_file), "--shard", str(shard), *ends]
@@ -209,12 +232,14 @@ def start_workers(run: RunDirectory, fleet: Fleet, endpoint: str) -> None:
         for index in range(count):
             worker = f"{role}-{index}"
             flags = ["--transport", str(run.config_file), "--connect", endpoint, "--id", worker]
+            if run.config.arena.is_custom and role != "learner":
+                flags += ["--env", run.config.arena.env]
             fleet.start(role, worker, [*run_flags(run), *flags])
 
 
 def run_flags(run: RunDirectory) -> list[str]:
-    """Flags that name the run; its settings are in its file."""
-    return ["--run", run.path.name, "--run-dir", str(run.path.parent)]
+    """Flags that name the run; its settings are in its file, but for the port of its metrics."""
+    return ["--run", run.path.name, "--run-dir", str(run.path.parent), *_OWN_METRICS]
 
 
 def expectation(config: Config) -> str:
@@ -234,8 +259,8 @@ def write_plots(run_dir: Path, hurry: StopSignal) -> None:
 
     Log its progress, or why they are missing.
     """
-    film = run_dir / FILM
-    before = film.stat().st_mtime_ns if film.exists() else None
+    films = [run_dir / name for name in (MOVING_PICTURE, FILM)]  # as they are written, at the end
+    before = [_written_ns(film) for film in films]
     report = subprocess.Popen(
         [*COMMAND, "report", str(run_dir)],
         stdout=subprocess.DEVNULL,
@@ -251,12 +276,19 @@ def write_plots(run_dir: Path, hurry: StopSignal) -> None:
     if report.poll() is None:
         report.kill()
         report.wait()
-        if film.exists() and film.stat().st_mtime_ns != before:
-            film.unlink()  # it is written last, and was cut off
+        now = [_written_ns(film) for film in films]
+        changed = [f for f, was, at in zip(films, before, now, strict=True) if at not in (was, 0)]
+        for film in changed[-1:]:
+            film.unlink()  # it was cut off
         why = f"skipped ({hurry.cause})" if hurry.is_set() else f"given up after {_PLOTS_S:g} s"
         _LOG.warning("plots and video %s; `mrcdrl report %s` writes them", why, run_dir)
     elif report.returncode:
         _LOG.warning("plots or video are missing: %s", last_line)
+
+
+def _written_ns(path: Path) -> int:
+    """When the file was last written; 0 if there is none."""
+    return path.stat().st_mtime_ns if path.exists() else 0
 
 
 def _lines_until(process: "subprocess.Popen[bytes]", enough: Callable[[], bool]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from mrcdrl.services.train.ending import ending, ending_as_json
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.forecast import forecast
 from mrcdrl.services.train.launcher import expectation, plan_run, supervise, write_plots
+from mrcdrl.services.train.page import Page
 
 _LOG = logging.getLogger("train")
 
@@ -29,15 +30,21 @@ def main(argv: Sequence[str]) -> int:
         _LOG.info("%srun %s: %s", prefix, run.path, expectation(run.config))
         fleet = Fleet(run.logs)
         try:
-            with Recorder(run.path, run.config) as recorder:
+            with (
+                Recorder(run.path, run.config) as recorder,
+                Page(run, wanted=plan.page) as page,
+            ):
                 try:
-                    reason = supervise(run, fleet, recorder, stop, hurry)
+                    reason = supervise(run, fleet, recorder, stop, hurry, page)
                 except MrcdrlError as error:
                     recorder.summarize(failed(str(error)))
                     raise
+                fleet.stop()
+                if plan.plots:
+                    _LOG.info("%s; writing plots and video (Ctrl-C skips them) …", reason)
+                    write_plots(run.path, hurry)
+                recorder.record_pictures()
         finally:
             fleet.stop()
-        _LOG.info("%s; writing plots and video (Ctrl-C skips them) …", reason)
-        write_plots(run.path, hurry)
     sys.stdout.write(ending_as_json(run.path) if plan.json else ending(run.path, reason))
     return 0

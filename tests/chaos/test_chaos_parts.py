@@ -28,8 +28,8 @@ from tests.chaos.chaos_faults import (
 )
 from tests.chaos.chaos_hosts import Host, hosts, owned_name, run
 from tests.chaos.chaos_observer import Life, Observer, compare
-from tests.patience import PATIENCE_S
-from tests.system.system_processes import REPOSITORY, environment, eventually
+from tests.patience import PATIENCE_S, eventually
+from tests.system.system_processes import REPOSITORY, environment
 
 SIZE, PORT = 100_000, 7000
 SERVER = f"""

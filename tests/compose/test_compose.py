@@ -24,11 +24,12 @@ from tests.compose.compose_stack import (
 from tests.patience import PATIENCE_S
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(4 * PATIENCE_S)]
-SERVICES = ("router", "replay", "learner", "actor", "evaluator", "status")
+SERVICES = ("router", "replay", "learner", "actor", "evaluator", "status", "web")
 UP_S = 3 * PATIENCE_S  # 60 on an idle machine
 AGAIN_S = PATIENCE_S  # from a fault to recovery
-SECURE, SHARDS, GPU, ZENOHD = (
-    REPOSITORY / f"compose.{name}.yml" for name in ("secure", "shards", "gpu", "zenohd")
+SECURE, SHARDS, GPU, ZENOHD, MONITORING = (
+    REPOSITORY / f"compose.{name}.yml"
+    for name in ("secure", "shards", "gpu", "zenohd", "monitoring")
 )
 SECURED = Path(__file__).with_name("secured.yml")
 INTRUDER = Path(__file__).with_name("intruder.py")
@@ -132,7 +133,8 @@ def test_it_may_do_no_more_than_it_must(stack: Stack, service: str) -> None:
     assert host["ReadonlyRootfs"]
     assert host["CapDrop"] == ["ALL"]
     assert host["SecurityOpt"] == ["no-new-privileges:true"]
-    assert not host["PortBindings"]
+    bound = [each["HostIp"] for ports in host["PortBindings"].values() for each in ports]
+    assert bound == (["127.0.0.1"] if service == "web" else [])  # the page, on this host alone
     assert stack.docker("exec", container.id, "id", "--user").strip() == "10001"
 
 
@@ -244,6 +246,29 @@ def test_the_learner_reserves_a_gpu(environment: dict[str, str]) -> None:
     assert "TORCH_INDEX" not in (plain["learner"]["build"].pop("args", None) or {})
     other = {"deploy": None, "image": None}
     assert learner | other == plain.pop("learner") | other
+    assert changed == plain
+
+
+def test_monitoring_adds_prometheus_and_grafana_and_ports_for_them(
+    environment: dict[str, str],
+) -> None:
+    """Check the configuration only: their images are not run."""
+    plain, changed = Stack(environment).config(), Stack(environment, MONITORING).config()
+    for name in ("prometheus", "grafana"):
+        added = changed.pop(name)
+        assert added["read_only"]
+        assert added["cap_drop"] == ["ALL"]
+        assert [port["host_ip"] for port in added["ports"]] == ["127.0.0.1"]
+        for mount in added["volumes"]:
+            assert mount["type"] == "volume" or Path(mount["source"]).exists()
+    metrics = {
+        "MRCDRL_TRANSPORT__METRICS_PORT": "9464",
+        "MRCDRL_TRANSPORT__METRICS_ADDRESS": "0.0.0.0",
+    }
+    for name in ("router", "replay", "learner", "actor", "evaluator", "status"):
+        given = plain[name].get("environment") or {}
+        assert changed[name].pop("environment") == given | metrics
+        plain[name].pop("environment", None)
     assert changed == plain
 
 

@@ -185,7 +185,7 @@ def test_volumes_are_there(name: str) -> None:
 
 def test_whoever_shares_the_volume_goes_where_the_others_are() -> None:
     sharing = {name for name, pod in PODS.items() if "affinity" in pod["spec"]}
-    assert sharing == {"learner", "evaluator", "status"}
+    assert sharing == {"learner", "evaluator", "status", "web"}
     for name in sharing:
         (term,) = PODS[name]["spec"]["affinity"]["podAffinity"][
             "requiredDuringSchedulingIgnoredDuringExecution"

@@ -22,7 +22,7 @@ PACKAGES = ("common", "services", "configs")  # links of these names in mrcdrl/ 
 FOLDERS = (*PACKAGES, "mrcdrl", "tests", "docs", "examples", "experiments")
 FILES = (
     *("pyproject.toml", "MANIFEST.in", "constraints.txt", "Makefile"),
-    *("README.md", "CHANGELOG.md", "LICENSE"),
+    *("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE"),
 )
 BROKEN = "raise SystemExit('imported from the working directory')\n"
 
@@ -132,6 +132,8 @@ def test_the_sdist_holds_tests_docs_grids_and_licence(built: tuple[Path, Path]) 
     assert not [name for name, member in names.items() if member.issym() or member.islnk()]
     assert names.keys() >= {
         "CHANGELOG.md",
+        "CITATION.cff",
+        "CONTRIBUTING.md",
         "LICENSE",
         "README.md",
         "constraints.txt",

@@ -6,11 +6,11 @@ import pytest
 from filelock import FileLock
 from pydantic import TypeAdapter
 
+from tests.patience import eventually
 from tests.system.system_processes import (
     Command,
     Finished,
     end_all,
-    eventually,
     processes_of,
     run_name,
     shared_memory_of,

@@ -8,16 +8,14 @@ import os
 import re
 import signal
 import subprocess
-import threading
-import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from mrcdrl.common.runtime.process import COMMAND
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, eventually
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 T = TypeVar("T")
@@ -39,7 +37,8 @@ def run_name(stem: str) -> str:
 
 def smoke_training(folder: Path, name: str) -> list[str | Path]:
     """Arguments that train the smoke preset at its smallest, with its run in a folder."""
-    return ["train", "--config", "smoke", "--run-dir", folder, "--name", name, *SMALL]
+    named = ["--run-dir", folder, "--name", name]
+    return ["train", "--config", "smoke", "--no-web", *named, *SMALL]
 
 
 def environment(**more: str) -> dict[str, str]:
@@ -125,22 +124,6 @@ class Finished:
     err: str
     processes_left: dict[int, str]
     shared_memory: set[Path]  # files that its processes had mapped
-
-
-def eventually(
-    look: Callable[[], T | None],
-    what: str,
-    timeout_s: float = PATIENCE_S,
-    pause_s: float = 0.05,
-) -> T:
-    """The first true result of `look`; fails after timeout_s."""
-    pause = threading.Event()
-    deadline = time.monotonic() + timeout_s
-    while not (found := look()):
-        if time.monotonic() > deadline:
-            raise AssertionError(f"in {timeout_s:g} s not: {what}")
-        pause.wait(pause_s)
-    return found
 
 
 def serves(replay: Command) -> None:

@@ -76,7 +76,7 @@ class Witness:
         self._reader = reader
         self._decode = make_codec(config.arena).decode
         self._config = config
-        self._policy = make_policy(config)
+        self._policy = make_policy(config, averages=False)  # as actors do
         self._policy.adopt(weights)
         self.seen: dict[int, Transition] = {}
         self.versions: set[int] = set()

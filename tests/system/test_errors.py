@@ -13,12 +13,12 @@ import pytest
 
 from mrcdrl.common.transport import free_endpoint
 from mrcdrl.services.learner import checkpoint
+from tests.patience import eventually
 from tests.system.system_processes import (
     Command,
     Finished,
     end_all,
     error_line,
-    eventually,
     processes_of,
     run_name,
     smoke_training,

@@ -50,6 +50,9 @@ def test_a_controller_is_judged_the_same_for_the_same_seed(tmp_path: Path) -> No
     assert first["success_rate"] > 0.5  # it sees the true state
     assert first["max_per_100"] >= first["mean_per_100"] >= 0
     assert first["variance_per_100"] >= 0
+    assert len(first["outcomes"]) == 40
+    for letter, name in (("s", "success"), ("c", "collision"), ("t", "timeout")):
+        assert first["outcomes"].count(letter) == round(40 * first[f"{name}_rate"])
     navigation = first["navigation"]
     assert navigation["success_rate"] == first["success_rate"]
     collided = [navigation[f"collision_with_{whom}_rate"] for whom in ("robot", "wall")]

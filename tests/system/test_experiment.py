@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     Command,
     end_all,
-    eventually,
     processes_of,
     run_name,
 )

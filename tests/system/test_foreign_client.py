@@ -14,12 +14,12 @@ from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import weights_to_bytes
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     REPOSITORY,
     Command,
     environment,
-    eventually,
     run_name,
 )
 

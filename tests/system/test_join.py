@@ -19,12 +19,12 @@ from mrcdrl.common.sync.joining import ENDPOINT_FILE
 from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Presence, QueueSubscriber, Session
 from mrcdrl.common.transport.keys import Keys, role_and_worker
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     Command,
     end_all,
     error_line,
-    eventually,
     processes_of,
     run_name,
     smoke_training,
@@ -153,7 +153,7 @@ def test_who_would_be_another_is_refused_in_one_line(live: Live) -> None:
 
 
 def test_a_second_launcher_is_refused_while_the_run_is_up(live: Live) -> None:
-    arguments = ["train", "--resume", live.name, "--run-dir", live.folder]
+    arguments = ["train", "--no-web", "--resume", live.name, "--run-dir", live.folder]
     with Command(arguments, live.folder) as second:
         assert second.wait() == 1
     assert "in use by another process" in error_line(second.err)

@@ -13,12 +13,12 @@ from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.learner.learner import LearnerState
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     SMALL,
     Command,
     end_all,
-    eventually,
     run_name,
     serves,
 )

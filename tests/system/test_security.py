@@ -21,11 +21,11 @@ from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Pulse
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.tools.certificates import make
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     SMALL,
     Command,
-    eventually,
     run_name,
     serves,
 )

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import eventually
 from tests.system.system_processes import (
     Command,
     end_all,
-    eventually,
     processes_of,
     run_name,
     smoke_training,

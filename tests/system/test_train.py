@@ -21,12 +21,12 @@ import pytest
 from mrcdrl.common.config import validate_config
 from mrcdrl.services.learner import checkpoint
 from mrcdrl.services.monitor.records import read_episodes, read_evaluations, read_last_metrics
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     Command,
     Finished,
     end_all,
-    eventually,
     processes_of,
     run_name,
     shared_memory_of,
@@ -125,7 +125,16 @@ def test_resume_goes_on_until_interrupted(finished: Finished, tmp_path: Path) ->
     run = tmp_path / name
     shutil.copytree(finished.path, run)
     episodes, before = len(read_episodes(run)), summary_of(run)
-    arguments = ["train", "--resume", name, "--run-dir", tmp_path, "--learner-steps", NEVER]
+    arguments = [
+        "train",
+        "--no-web",
+        "--resume",
+        name,
+        "--run-dir",
+        tmp_path,
+        "--learner-steps",
+        NEVER,
+    ]
     with Command(arguments, tmp_path) as train:
         eventually(
             lambda: metric(run, "learner_steps") >= 80 and train.process.poll() is None,

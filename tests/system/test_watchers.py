@@ -11,6 +11,7 @@ import pytest
 
 from mrcdrl.common.runtime.process import CLOSED_PIPE, COMMAND
 from mrcdrl.services.monitor.records import read_evaluations, read_last_metrics
+from tests.patience import eventually
 from tests.system.system_processes import (
     PATIENCE_S,
     REPOSITORY,
@@ -18,7 +19,6 @@ from tests.system.system_processes import (
     end_all,
     environment,
     error_line,
-    eventually,
     processes_of,
     run_name,
     smoke_training,

@@ -15,7 +15,7 @@ from mrcdrl.common.arena.images.rendering import literal_views
 from mrcdrl.common.arena.images.views import AnalyticViews
 from mrcdrl.common.arena.world.scene import Scene
 from mrcdrl.common.config import ArenaConfig
-from mrcdrl.common.messages.trajectory import Float32Array, UInt8Array
+from mrcdrl.common.messages.trajectory import Float32Array, Int64Array, UInt8Array
 
 _NUMBER = np.dtype("<f4")
 _SEED = np.dtype("<u4")
@@ -86,6 +86,12 @@ class SceneCodec:
         if self._config.pixel_noise:
             add_noise(views, flat.view(_SEED)[:, -1], self._config.pixel_noise)
         return images
+
+    def present(self, records: UInt8Array) -> Int64Array:
+        """How many robots are in the scene of each record [..., R]."""
+        robots = np.ascontiguousarray(records).view(_NUMBER)[..., : self._ends[0]]
+        count: Int64Array = np.isfinite(robots[..., ::3]).sum(axis=-1)
+        return count
 
     def _scene_of(self, numbers: Float32Array) -> Scene:
         with np.errstate(invalid="ignore"):

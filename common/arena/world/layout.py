@@ -86,8 +86,10 @@ def layout_symmetries(config: ArenaConfig) -> tuple[Symmetry, ...]:
     Unrotated images: those that map all fixed targets, obstacles and inner walls onto themselves,
     for each number of robots; all 8 if nothing is fixed. Heading-up images do not change when the
     arena is rotated, and a reflection mirrors them left to right: so the identity, and the mirror
-    if a reflection maps the layout onto itself.
+    if a reflection maps the layout onto itself. A custom world's layout is not known: the identity.
     """
+    if config.is_custom:
+        return (IDENTITY,)
     each = [config.with_robots(number) for number in config.numbers]
     kept = tuple(s for s in SYMMETRIES if all(_maps_onto_itself(s, one) for one in each))
     if config.orientation == "unrotated":

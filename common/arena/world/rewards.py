@@ -49,6 +49,20 @@ def target_distances_px(scene: Scene) -> Float64Array:
     return distances
 
 
+def drawn_to_occupied(scene: Scene) -> BoolArray:
+    """Whether another robot is nearer to the target that is nearest to each robot, [..., K].
+
+    scene: arenas [...], with K robots each. A robot that is absent, with a pose of NaN, is drawn to
+    none and occupies none.
+    """
+    distances = np.nan_to_num(target_distances_px(scene), nan=np.inf)
+    own = distances.min(axis=-1)
+    nearest_robot = distances.min(axis=-2)  # of each target, [..., M]
+    target = distances.argmin(axis=-1)
+    occupied: BoolArray = (np.take_along_axis(nearest_robot, target, -1) < own) & np.isfinite(own)
+    return occupied
+
+
 def on_target_px(config: ArenaConfig) -> float:
     """Distance below which a robot is "on" a target: sqrt(s_w^2 + s_h^2 + c_r), as printed."""
     return math.sqrt(2 * config.target_size_px**2 + config.robot_radius_px)

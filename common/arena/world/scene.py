@@ -43,18 +43,24 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """The state in which an episode begins; the same arrays as a scene's."""
+    """The state in which an episode begins; the same arrays as a scene's.
+
+    Of a custom world only the seed counts.
+    """
 
     robots: Float64Array  # [K, 3], x px, y px, heading rad
     targets: Float64Array  # [M, 2], x px, y px
     obstacles: Float64Array = field(default_factory=_none)  # [O, 3], x px, y px, radius px
+    seed: int = 0  # of a custom world's episode
 
 
-def checked_actions(actions: ArrayLike, shape: tuple[int, ...]) -> UInt8Array:
+def checked_actions(
+    actions: ArrayLike, shape: tuple[int, ...], num_actions: int = NUM_ACTIONS
+) -> UInt8Array:
     """Converts actions to uint8; raises ValueError if shape, dtype or values are wrong."""
     array = np.asarray(actions)
     if array.shape != shape or array.dtype.kind not in "iu":
         raise ValueError(f"actions are {array.dtype} {array.shape}, not integers {shape}")
-    if ((array < 0) | (array >= NUM_ACTIONS)).any():
-        raise ValueError(f"actions {array.tolist()} are not all in 0..{NUM_ACTIONS - 1}")
+    if ((array < 0) | (array >= num_actions)).any():
+        raise ValueError(f"actions {array.tolist()} are not all in 0..{num_actions - 1}")
     return array.astype(np.uint8)

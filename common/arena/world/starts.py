@@ -16,6 +16,7 @@ from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import BoolArray, Float64Array
 
 _CANDIDATES = 32  # poses drawn at once per robot
+MOST_SEEDS = 2**31  # of a custom world
 _RESTARTS = 200  # after which a placement that got stuck is given up
 
 
@@ -32,9 +33,14 @@ def test_starts(config: ArenaConfig, num: int, seed: int) -> tuple[Start, ...]:
     """Draws starts of the paper's test: no collision at the start or within one rotation.
 
     In a rotation all robots turn left every frame until each has completed a circle. Random targets
-    are drawn from the seed too. Raises ConfigError if the robots do not fit.
+    are drawn from the seed too. Of a custom world a start is a seed. Raises ConfigError if the
+    robots do not fit.
     """
     rng = np.random.default_rng(seed)
+    if config.is_custom:
+        robots, targets = np.zeros((config.num_robots, 3)), np.zeros((config.num_robots, 2))
+        seeds = rng.integers(MOST_SEEDS, size=num).tolist()
+        return tuple(Start(robots, targets, seed=each) for each in seeds)
     num_turns = math.ceil(360 / config.turn_deg)
     starts = []
     for _ in range(num):

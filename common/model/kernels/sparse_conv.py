@@ -46,6 +46,14 @@ class NonzeroPixels:
     columns: UInt8Array
     intensities: Float32Array
 
+    def __getitem__(self, states: slice) -> "NonzeroPixels":
+        """The pixels of some states, as views."""
+        num, stack, size = self.shape
+        begin, end, _ = states.indices(num)
+        lines = slice(begin * stack * size, end * stack * size + 1)
+        shape = (end - begin, stack, size)
+        return NonzeroPixels(shape, self.ends[lines], self.columns, self.intensities)
+
 
 def nonzero_pixels(observation: Tensor) -> NonzeroPixels | None:
     """List the nonzero pixels of states uint8 [B, S, V, V] on the CPU.

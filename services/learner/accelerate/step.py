@@ -5,9 +5,10 @@ within rounding, whatever the number of threads; a captured step gives the numbe
 to the bit; nothing waits for the device.
 """
 
+import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ from mrcdrl.services.learner.accelerate.optimizer import (
     leaves,
 )
 from mrcdrl.services.learner.accelerate.thread_tuner import ThreadTuner
-from mrcdrl.services.learner.batch import Batch
+from mrcdrl.services.learner.batch import Ahead, Batch
 from mrcdrl.services.learner.loss import TDLoss, td_loss
 from mrcdrl.services.learner.step import Update
 
@@ -70,6 +71,8 @@ class AcceleratedStep:
         self._threads = DataParallel(num_threads)
         self._tuner = tuner
         self._target_operands = {n: x.detach().clone() for n, x in operands(target).items()}
+        self._target_version = 0
+        self._target_lock = threading.Lock()  # of the two above, for `ahead`
         self._learning_rate = torch.zeros((), device=device)  # where a captured step reads it
         self._optimizer = SharedOptimizer(online, agent, self._learning_rate, self._threads)
         self._capturer = capturer
@@ -123,17 +126,41 @@ class AcceleratedStep:
             )
 
         def target(states: States) -> Tensor:
+            ahead = rows.ahead
+            known = None if ahead is None else ahead.values_of(states, self._target_version)
+            if known is not None:
+                return known
             return fast_forward(self._target, states, self._target_operands)
 
-        prepared = rows.with_states(lambda x: prepare(self._online, x))
+        prepared = self._prepared(rows)
         found = td_loss(online, target, prepared, self._agent)
         loss = found.loss * (len(rows.keys) / size)
         return _Part(found, loss.detach(), gradients(loss, own, trace))
 
+    def _prepared(self, batch: Batch) -> Batch[States]:
+        """The batch with its states as the first layer takes them."""
+        if batch.ahead is not None:
+            return batch.with_states(batch.ahead.observation, batch.ahead.next_observation)
+        states = (batch.observation, batch.next_observation)
+        return batch.with_states(*(prepare(self._online, x) for x in states))
+
+    def ahead(self, batch: Batch) -> Batch:
+        """Add what is known ahead; nothing where every core has a thread of the step."""
+        if 1 < self._threads.num_threads == self._threads.active:
+            return batch
+        states = self._prepared(batch)
+        with torch.no_grad(), self._target_lock:
+            next_q = fast_forward(self._target, states.next_observation, self._target_operands)
+            version = self._target_version
+        known = Ahead(states.observation, states.next_observation, next_q, version)
+        return replace(batch, ahead=known)
+
     def target_changed(self) -> None:
         """Refresh the operands in place: a captured step reads them where they are."""
         fresh = operands(self._target)
-        torch._foreach_copy_(list(self._target_operands.values()), list(fresh.values()))
+        with self._target_lock:
+            torch._foreach_copy_(list(self._target_operands.values()), list(fresh.values()))
+            self._target_version += 1
 
     def moments(self) -> dict[str, Tensor]:
         return self._optimizer.moments()

@@ -15,7 +15,8 @@ from statistics import median
 _LOG = logging.getLogger("learner")
 _BLOCK = 20  # steps in a row with one count
 _ROUNDS = 3  # blocks of each count before a choice
-_HOLD_S = 60.0  # between a choice and the next trial
+_FIRST_HOLD_S = 8.0  # between a choice and the next trial: while kernels compile, it is soon wrong
+_HOLD_S = 60.0  # at most, twice as long each time
 
 
 class ThreadTuner:
@@ -26,6 +27,7 @@ class ThreadTuner:
         self._counts = tuple(counts)
         self._clock = clock
         self._chosen = 0
+        self._hold_s = _FIRST_HOLD_S
         self._begin_trial()
 
     def _begin_trial(self) -> None:
@@ -52,7 +54,8 @@ class ThreadTuner:
             self._begin_block()
             return
         self.count = min(self._counts, key=lambda count: median(self._seconds[count]))
-        self._hold_until_s = self._clock() + _HOLD_S
+        self._hold_until_s = self._clock() + self._hold_s
+        self._hold_s = min(2 * self._hold_s, _HOLD_S)
         if self.count != self._chosen:
             _LOG.info("%d of up to %d threads share a batch", self.count, max(self._counts))
         self._chosen = self.count

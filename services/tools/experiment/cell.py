@@ -14,26 +14,31 @@ or goes on from where it was killed.
 import fcntl
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
+from statistics import fmean
 from typing import IO, Any
 
 from mrcdrl.common.config import to_toml
+from mrcdrl.common.messages.trajectory import Outcome
 from mrcdrl.common.runtime.files import BEST_WEIGHTS, RUN_CONFIG, atomic_write
 from mrcdrl.services.monitor.recorder import SUMMARY
 from mrcdrl.services.monitor.records import (
+    SUCCESS_WINDOW,
+    EpisodeRecord,
     EvaluationRecord,
+    read_episodes,
     read_evaluations,
     read_last_metrics,
     to_line,
 )
 from mrcdrl.services.monitor.stopping import has_failed, was_stopped
-from mrcdrl.services.tools.experiment.grid import BEST, PROTOCOL, Cell
+from mrcdrl.services.tools.experiment.grid import BEST, FINAL, PROTOCOL, Cell
 
 RATES = (0.5, 0.8, 0.9, 0.93, 0.94)
 _LEAST_MINUTES = 0.01  # 0 would be no limit
-_TRAINED = 0.95  # fraction of a cell that training makes; plots and evaluations follow
+_TRAINED = 0.95  # fraction of a cell that training makes; evaluations follow
 
 
 class State(StrEnum):
@@ -75,7 +80,7 @@ class CellFiles:
         result = _read(self._done)
         asked = set(self.cell.trial.weights)
         whole = result is not None and all(
-            name in result["evaluate"] and _is_of(result["evaluate"][name], self.cell)
+            name in result["evaluate"] and _is_of(result["evaluate"][name], name, self.cell)
             for name in asked
         )
         return result if whole else None
@@ -115,10 +120,11 @@ class CellFiles:
 
     def train(self) -> list[str]:
         """Arguments of `mrcdrl train`, for a new run or to go on."""
-        folder = ["--run-dir", str(self.run.parent)]
+        folder = ["--run-dir", str(self.run.parent), "--no-plots", "--no-web"]
         if not self.run.exists():
-            return ["train", "--config", str(self._toml), "--name", self.run.name, *folder]
-        arguments = ["train", "--resume", self.run.name, *folder]
+            named = ["--config", str(self._toml), "--name", self.run.name]
+            return ["train", *named, *folder, "--no-web"]
+        arguments = ["train", "--resume", self.run.name, *folder, "--no-web"]
         minutes = self.cell.config.run.minutes
         if minutes:  # train counts them from its start
             left = max(_LEAST_MINUTES, minutes - self.lasted_s / 60)
@@ -144,15 +150,17 @@ class CellFiles:
         """Arguments of each `mrcdrl evaluate` that is still due, and the file for its result."""
         trial = self.cell.trial
         for name in trial.weights:
-            weights, target = self._weights(name), self._beside(name)
-            if weights is None or (target.exists() and _is_of(_read(target), self.cell)):
+            weights, target = self.weights(name), self._beside(name)
+            if weights is None or (target.exists() and _is_of(_read(target), name, self.cell)):
                 continue
             flags = ["--episodes", str(trial.episodes), "--seed", str(trial.seed), "--json"]
+            if trial.values and name == FINAL:
+                flags.append("--values")
             if self.cell.config.arena.mixes_numbers:
                 flags += ["--robots", str(self.cell.robots)]
             yield ["evaluate", str(weights), *flags], target
 
-    def _weights(self, name: str) -> Path | None:
+    def weights(self, name: str) -> Path | None:
         """The file or checkpoint that holds the weights; None if the run left none."""
         if name == BEST:
             best = self.run / BEST_WEIGHTS
@@ -180,6 +188,7 @@ class CellFiles:
             "reached": {f"{rate:g}": _reached(evaluations, rate) for rate in RATES},
             "last": _success(evaluations[-1]) if evaluations else None,
             "best": _success(max(evaluations, key=_rate)) if evaluations else None,
+            "training": hundreds(read_episodes(self.run), cell.config.agent.reward_scale),
             "evaluate": {name: _read(self._beside(name)) for name in cell.trial.weights},
             "machine": summary["machine"],
             "versions": summary["versions"],
@@ -202,10 +211,28 @@ def _read(path: Path) -> Any:
     return json.loads(path.read_bytes()) if path.exists() else None
 
 
-def _is_of(evaluation: dict[str, Any] | None, cell: Cell) -> bool:
+def _is_of(evaluation: dict[str, Any] | None, name: str, cell: Cell) -> bool:
     """Whether the evaluation is what the grid asks for; None: there were no such weights."""
+    if evaluation is None:
+        return True
+    values_due = cell.trial.values and name == FINAL and evaluation.get("values") is None
     trial = (cell.trial.episodes, cell.trial.seed)
-    return evaluation is None or (evaluation["episodes"], evaluation["seed"]) == trial
+    return not values_due and (evaluation["episodes"], evaluation["seed"]) == trial
+
+
+def hundreds(episodes: Sequence[EpisodeRecord], reward_scale: float) -> dict[str, list[float]]:
+    """Each whole hundred of training episodes: successes, means, and learner steps at its end."""
+    blocks = [
+        episodes[end - SUCCESS_WINDOW : end]
+        for end in range(SUCCESS_WINDOW, len(episodes) + 1, SUCCESS_WINDOW)
+    ]
+    each = [[record.episode for record in block] for block in blocks]
+    return {
+        "successes": [sum(e.outcome is Outcome.SUCCESS for e in block) for block in each],
+        "score": [round(fmean(e.score for e in block), 3) for block in each],
+        "mean_q": [round(fmean(e.mean_q for e in block) / reward_scale, 3) for block in each],
+        "learner_steps": [block[-1].learner_steps for block in blocks],
+    }
 
 
 def _rate(record: EvaluationRecord) -> float:

@@ -16,7 +16,7 @@ from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.files import sha256
 from mrcdrl.common.runtime.names import check_name
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Version of how the software learns and judges, raised by hand when either changes: the cells of
 all grids are then new ones. A refactoring leaves it alone, and with it the results."""
 
@@ -24,7 +24,14 @@ FINAL, BEST = "final", "best"  # weights: of the last checkpoint; kept by the ru
 _ENDS = ("learner_steps", "minutes", "target_success_rate", "patience_episodes")
 _SEEDED = ("run.seed", "learner.seed", "replay.seed")  # not the evaluator's: all have one test
 _KEYS = {"base": str, "robots": list, "seeds": list, "budget": dict, "evaluate": dict}
-_EVALUATE = {"episodes": int, "seed": int, "weights": list}
+_EVALUATE = {"episodes": int, "seed": int, "weights": list, "values": bool}
+_KINDS = {
+    str: "text",
+    list: "a list",
+    dict: "a table",
+    int: "a whole number",
+    bool: "true or false",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +41,7 @@ class Trial:
     episodes: int = 1100
     seed: int = 0  # of the starts; unlike the run's own evaluator.seed
     weights: tuple[str, ...] = ()  # FINAL, BEST
+    values: bool = False  # of FINAL: also compare action values with returns
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +86,17 @@ def read_grid(path: Path) -> list[Cell]:
     except ConfigError as error:
         raise ConfigError(f"grid {str(path)!r} is {error}") from error
     try:
-        return list(_cells(table, path.parent))
+        return grid_cells(table, path.parent)
     except ConfigError as error:
         raise ConfigError(f"grid {str(path)!r}: {error}") from error
+
+
+def grid_cells(table: Mapping[str, Any], folder: Path = Path()) -> list[Cell]:
+    """Cells of a grid that is given as a table, as its TOML file would hold it.
+
+    folder: of the base, if that is a file. Raises ConfigError with one line for what is wrong.
+    """
+    return list(_cells(dict(table), folder))
 
 
 def _cells(table: dict[str, Any], folder: Path) -> Iterator[Cell]:
@@ -121,8 +137,7 @@ def _check_types(table: Mapping[str, Any], known: Mapping[str, type], above: str
         if name not in known:
             raise ConfigError(f"unknown key {above + name!r}; known: {', '.join(known)}")
         if type(value) is not known[name]:
-            kind = {str: "text", list: "a list", dict: "a table", int: "a whole number"}
-            raise ConfigError(f"{above}{name} must be {kind[known[name]]} (given {value!r})")
+            raise ConfigError(f"{above}{name} must be {_KINDS[known[name]]} (given {value!r})")
 
 
 def _base(table: Mapping[str, Any], folder: Path) -> str:
@@ -160,6 +175,8 @@ def _trial(table: Mapping[str, Any]) -> Trial:
     if not set(given["weights"]) <= {FINAL, BEST}:
         raise ConfigError(f"evaluate.weights holds {FINAL!r} or {BEST!r} (not {given['weights']})")
     trial = Trial(**{**given, "weights": tuple(given["weights"])})
+    if trial.values and FINAL not in trial.weights:
+        raise ConfigError(f"evaluate.values needs {FINAL!r} in evaluate.weights")
     if trial.episodes < 1 or trial.seed < 0:
         raise ConfigError("evaluate.episodes must be at least 1, and evaluate.seed not below 0")
     return trial

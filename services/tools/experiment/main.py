@@ -4,7 +4,6 @@ Invariants: killed at any moment, the same command goes on where it was; what is
 again.
 """
 
-import fnmatch
 import logging
 import sys
 import time
@@ -12,19 +11,21 @@ from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 
-from mrcdrl.common.config.arguments import Parser, whole_number
+from mrcdrl.common.config.arguments import Parser
 from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.runtime.files import atomic_write, reason
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.runs import runs_folder
 from mrcdrl.services.monitor.records import to_line
+from mrcdrl.services.tools.experiment.asked import named_like, print_states
 from mrcdrl.services.tools.experiment.cell import CellFiles
+from mrcdrl.services.tools.experiment.flags import add_cell_flags
 from mrcdrl.services.tools.experiment.grid import read_grid
 from mrcdrl.services.tools.experiment.runner import run_cells
 from mrcdrl.services.tools.experiment.table import table
 
 _LOG = logging.getLogger("experiment")
-_RESULTS = "results.jsonl"
+RESULTS = "results.jsonl"
 _REPORT_S = 30.0
 
 
@@ -33,29 +34,27 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser().parse_args(argv)
     out = arguments.out or runs_folder() / "experiments" / arguments.grid.stem
     every = [CellFiles(cell, out) for cell in read_grid(arguments.grid)]
-    asked = [f for f in every if fnmatch.fnmatchcase(f.cell.name, arguments.only)]
+    asked = named_like(every, arguments.only)
     if not asked:
         names = ", ".join(files.cell.name for files in every)
         raise ConfigError(f"no cell is named like {arguments.only!r}; the cells are {names}")
     if arguments.list:
-        states = {files.cell.name: files.state for files in asked}
-        lines = "".join(f"{state:<8} {name}\n" for name, state in states.items())
-        sys.stdout.write(to_line(states) if arguments.json else lines)
+        print_states(asked, as_json=arguments.json)
         return 0
     stop = StopSignal().listen()
     command = " ".join(["mrcdrl experiment", *argv])
     try:
         (out / "cells").mkdir(parents=True, exist_ok=True)
-        run_cells(asked, arguments.jobs, command, stop, _reporter(asked))
+        run_cells(asked, arguments.jobs, command, stop, reporter(asked))
         results = [result for result in (files.result() for files in every) if result]
-        atomic_write(out / _RESULTS, "".join(map(to_line, results)).encode())
+        atomic_write(out / RESULTS, "".join(map(to_line, results)).encode())
     except OSError as error:
         raise RunDirectoryError(f"{out} cannot be written: {reason(error)}") from error
     if arguments.json:
         sys.stdout.writelines(map(to_line, results))
     else:
         sys.stdout.write(table(every))
-        print(f"{out / _RESULTS}: {len(results)} of {len(every)} results")
+        print(f"{out / RESULTS}: {len(results)} of {len(every)} results")
     return 0 if all(files.result() for files in asked) else 1
 
 
@@ -63,20 +62,15 @@ def parser() -> Parser:
     """The command's flags."""
     made = Parser(prog="mrcdrl experiment", description="Train a grid: settings and seeds.")
     made.add_argument("grid", type=Path, metavar="GRID", help="TOML file: see docs/experiments.md")
-    made.add_argument(
-        "--out", type=Path, metavar="DIR", help="of results; default: runs/experiments/GRID"
-    )
-    made.add_argument(
-        "--jobs", type=whole_number(1), metavar="N", default=1, help="cells at once; default: 1"
-    )
-    made.add_argument("--only", metavar="PATTERN", default="*", help="cells named so, as 'x-*'")
-    made.add_argument("--list", action="store_true", help="print each cell's state, do nothing")
-    made.add_argument("--json", action="store_true", help="print results as JSON, one a line")
+    add_cell_flags(made, "cell", out="runs/experiments/GRID", example="x-*", printed="results")
     return made
 
 
-def _reporter(cells: Sequence[CellFiles]) -> Callable[[int], None]:
-    """Say how far the cells are and how long the rest takes, every half minute and as cells end."""
+def reporter(cells: Sequence[CellFiles]) -> Callable[[int], None]:
+    """Make what says how far the cells are, and how long the rest takes.
+
+    It says so every half minute, and as cells end.
+    """
     began_s = time.monotonic()
     before = sum(map(_fraction, cells))
     shown = {"s": -_REPORT_S, "done": -1}

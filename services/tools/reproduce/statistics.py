@@ -19,6 +19,7 @@ RESAMPLES = 10_000
 CONFIDENCE = 0.95
 LEVEL = 0.05  # of the tests, after Holm's correction
 EQUAL = 3.0  # points of success within which two kinds count as equal
+MIN_SEEDS = 5  # with three of each kind no difference is significant, and intervals are too narrow
 _MAX_PERMUTATIONS = 100_000  # above, a random sample of them
 
 Values = NDArray[np.float64]
@@ -57,6 +58,9 @@ class Comparison:
     difference: Interval  # of interquartile means, points
     improvement: Interval  # probability that a run of the first beats one of the second
     p_value: float  # two-sided permutation test; NaN if it was not tested
+
+
+Judged = Sequence[tuple[Comparison, float]]  # each with its p-value after Holm's correction
 
 
 def interquartile_mean(values: Values) -> Values:
@@ -141,24 +145,77 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     return corrected
 
 
-def verdict(comparison: Comparison, corrected_p: float, papers_difference: float) -> Verdict:
+def verdict(comparison: Comparison, corrected_p: float, papers_difference: float | None) -> Verdict:
     """What a comparison says of the paper's claim that the first kind is better.
 
-    corrected_p: after Holm's correction. papers_difference: points, as printed in the paper. A
-    difference that surely lies within ±3 points counts as equal, significant or not. An interval
-    too wide for any answer is inconclusive.
+    corrected_p: after Holm's correction. papers_difference: points, as printed in the paper; None
+    if it prints no number. A difference that surely lies within ±3 points counts as equal,
+    significant or not. An interval too wide for any answer, or too few seeds, are inconclusive.
     """
     difference = comparison.difference
-    if math.isnan(difference.estimate):
-        return Verdict.NOT_TESTED
+    if early := _too_early(difference):
+        return early
     if difference.within(EQUAL):
         return Verdict.EQUAL
     if corrected_p >= LEVEL:
         return Verdict.INCONCLUSIVE
     if difference.estimate < 0:
         return Verdict.CONTRADICTED
-    papers = difference.low <= papers_difference <= difference.high
+    papers = papers_difference is None or difference.low <= papers_difference <= difference.high
     return Verdict.REPRODUCED if papers else Verdict.DIRECTION
+
+
+def verdict_of_equality(pairs: Judged) -> Verdict:
+    """What comparisons say of the claim that none differs."""
+    if early := _earliest(pairs):
+        return early
+    apart = [(c, p) for c, p in pairs if not c.difference.within(EQUAL)]
+    if not apart:
+        return Verdict.REPRODUCED
+    differs = any(p < LEVEL for _, p in apart)
+    return Verdict.CONTRADICTED if differs else Verdict.INCONCLUSIVE
+
+
+def verdict_of_best(rivals: Judged) -> Verdict:
+    """What comparisons with all rivals say of the claim that the first kind is the best.
+
+    Better than some, and equal to the others, is its direction only.
+    """
+    if early := _earliest(rivals):
+        return early
+    apart = [(c, p) for c, p in rivals if not c.difference.within(EQUAL)]
+    if not apart:
+        return Verdict.EQUAL
+    if any(p < LEVEL and c.difference.estimate < 0 for c, p in apart):
+        return Verdict.CONTRADICTED
+    if any(p >= LEVEL for _, p in apart):
+        return Verdict.INCONCLUSIVE
+    return Verdict.REPRODUCED if len(apart) == len(rivals) else Verdict.DIRECTION
+
+
+def verdict_of_level(found: Interval, papers: float) -> Verdict:
+    """What an interval says of the claim that a value is at least the paper's, ±3 points."""
+    if early := _too_early(found):
+        return early
+    if found.low >= papers - EQUAL:
+        return Verdict.REPRODUCED
+    return Verdict.CONTRADICTED if found.high < papers - EQUAL else Verdict.INCONCLUSIVE
+
+
+def _too_early(found: Interval) -> Verdict | None:
+    """The verdict where there are too few seeds for one; else None."""
+    if math.isnan(found.estimate):
+        return Verdict.NOT_TESTED
+    return Verdict.INCONCLUSIVE if found.seeds < MIN_SEEDS else None
+
+
+def _earliest(judged: Judged) -> Verdict | None:
+    """Not tested if one is not; else inconclusive if one has too few seeds; else None."""
+    early = {_too_early(comparison.difference) for comparison, _ in judged}
+    for found in (Verdict.NOT_TESTED, Verdict.INCONCLUSIVE):
+        if found in early:
+            return found
+    return None
 
 
 def _resampled(sample: Values, stream: int) -> Values:

@@ -1,20 +1,21 @@
 """Actors without arenas and inference: their messages are real, the contents are made up.
 
-Each simulated actor has the network side of a real one: two sessions, a liveliness token, a
-`Sender` with its thread, a subscription to the weights, statistics once a second, a summary of each
-episode. Invariants: a full spool stops an actor's clock, as it stops arenas; a process of simulated
-actors ends when its parent does.
+Each simulated actor has the network side of a real one: a session, its name's claim, a liveliness
+token, a lease, a `Sender` with its thread, a subscription to the weights, statistics once a second,
+a summary of each episode. Invariants: a full spool stops an actor's clock, as it stops arenas; a
+process of simulated actors ends when its parent does.
 """
 
+import contextlib
 import signal
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import count
 from multiprocessing.connection import Connection
-from time import monotonic, time_ns
+from time import monotonic, sleep, time_ns
 from typing import Protocol
 
 import numpy as np
@@ -32,19 +33,23 @@ from mrcdrl.common.messages.trajectory import (
     Outcome,
     UInt8Array,
 )
-from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.messages.wire import encode, learner_step_of
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.claim import claim_name
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
+from mrcdrl.services.actor.lease import LeaseClient
 from mrcdrl.services.actor.sender import Sender
 from mrcdrl.services.replay.client import ReplayWriter, shard_of
 
 EPISODE_FRAMES = 186  # mean of benchmarks/results/quick-2robots
 _EPISODES = 8  # different ones, then they repeat
 _TICK_S = 0.01
+_TURNS = 10  # ticks in which each actor once looks for weights, and reports if that is due
 _TALLY_S = 1.0
+_DRAIN_S = 5.0  # to have acknowledged what was made before the end
 BEGIN, STOP = "begin", "stop"
 _NOT_SIMULATED = read(ActorMetrics, {})  # 0 for every metric
 
@@ -66,12 +71,19 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """A process's counts since it began, and its insert latencies since the last tally."""
+    """A process's counts since it began, and its latencies since the last tally.
+
+    Before it begins, its count `joined`; with `last`, what had become of all that it made.
+    """
 
     seconds: float = 0.0  # since it began
     counts: Counter[str] = field(default_factory=Counter)
     insert_s: Float64Array = field(default_factory=lambda: np.empty(0))
+    weights_s: Float64Array = field(default_factory=lambda: np.empty(0))
     last: bool = False
+
+
+Joined = Callable[[int], None]  # takes how many of a process's have joined so far
 
 
 class Simulated(Protocol):
@@ -79,7 +91,9 @@ class Simulated(Protocol):
 
     def begin(self, now_s: float) -> None: ...
     def work(self, now_s: float) -> None: ...
-    def done(self) -> tuple[Counter[str], Float64Array]: ...
+    def tally(self, seconds: float) -> Tally: ...
+    def drained(self) -> bool:
+        """Whether all that was made is acknowledged; after a call nothing more is made."""
 
 
 def follow(connection: Connection, simulated: Simulated) -> None:
@@ -87,7 +101,6 @@ def follow(connection: Connection, simulated: Simulated) -> None:
 
     Raises EOFError when the parent ends.
     """
-    connection.send(Tally())
     connection.recv()
     began_s = sent_s = monotonic()
     simulated.begin(began_s)
@@ -95,9 +108,18 @@ def follow(connection: Connection, simulated: Simulated) -> None:
         simulated.work(monotonic())
         if monotonic() - sent_s >= _TALLY_S:
             sent_s = monotonic()
-            connection.send(Tally(sent_s - began_s, *simulated.done()))
+            connection.send(simulated.tally(sent_s - began_s))
     connection.recv()
-    connection.send(Tally(monotonic() - began_s, *simulated.done(), last=True))
+    ended_s = monotonic()
+    connection.send(simulated.tally(ended_s - began_s))
+    while not simulated.drained() and monotonic() < ended_s + _DRAIN_S:
+        sleep(_TICK_S)
+    connection.send(replace(simulated.tally(ended_s - began_s), last=True))
+
+
+def tell_joined(connection: Connection) -> Joined:
+    """Tells the parent how many have joined."""
+    return lambda number: connection.send(Tally(counts=Counter(joined=number)))
 
 
 @contextmanager
@@ -109,13 +131,14 @@ def answering(connection: Connection) -> Iterator[None]:
     except (EOFError, BrokenPipeError):
         return
     except MrcdrlError as error:
-        connection.send(str(error))
+        with contextlib.suppress(BrokenPipeError):  # the parent has ended for another reason
+            connection.send(str(error))
 
 
 def act(plan: Plan, connection: Connection) -> None:
     """Run a process's simulated actors until the parent sends STOP."""
     with answering(connection), ExitStack() as owned:
-        actors = SimulatedActors(plan)
+        actors = SimulatedActors(plan, tell_joined(connection))
         owned.callback(actors.close)
         follow(connection, actors)
 
@@ -149,17 +172,24 @@ class SimulatedActor:
         chunks: Sequence[Chunk],
         session: Session,
         writer: TimedWriter,
+        stop: StopSignal,
     ) -> None:
+        """Join as a real actor does; raises TransportError or NameTakenError."""
         config, keys = plan.config, plan.keys
+        session.client(keys.config, "replay").ask(b"").result()
+        claim_name(session, keys, "actor", worker, stop)
         self._worker, self._rate, self._chunks = worker, plan.rate, chunks
         self._incarnation, self._sequence = time_ns(), 0
-        self._episode_steps = EPISODE_FRAMES * config.arena.num_robots
-        self._made = self._episodes = 0
+        self._num_robots = config.arena.num_robots
+        self._episode_steps = EPISODE_FRAMES * self._num_robots
+        self._episodes = 0
         self._due_s = 0.0
         self.waited_s = 0.0
+        self.made = 0  # transitions spooled so far
         self.counts: Counter[str] = Counter()
+        self.weights_s: list[float] = []
         session.announce(keys.live("actor", worker))
-        self._peers = session.presence(keys.everyone("actor"))
+        self._lease = LeaseClient(session, keys, worker, config.exploration.lease_s)
         self._weights = session.latest_subscriber(keys.weights)
         self._summaries = session.publisher(keys.episodes(worker))
         self._reporter = StatsReporter(
@@ -172,14 +202,18 @@ class SimulatedActor:
         """Start the clock. phase: time to the first chunk, as a fraction of a chunk's time."""
         self._due_s = now_s + phase * len(self._chunks[0]) / self._rate
 
-    def work(self, now_s: float) -> None:
-        """Spool the chunks that are due, take new weights, publish statistics."""
+    def spool(self, now_s: float) -> None:
+        """Spool the chunks that are due."""
         while self._due_s <= now_s and self._spool(now_s):
             pass
+
+    def look(self) -> None:
+        """Take new weights, renew the lease and publish statistics, where these are due."""
         weights = self._weights.take()
         if weights is not None:
             self.counts.update(weights=1, weights_bytes=len(weights))
-        self._peers.alive()
+            self.weights_s.append(monotonic() - published_s(weights))
+        self._lease.follow()
         self._reporter.publish_if_due(self._metrics)
 
     def _spool(self, now_s: float) -> bool:
@@ -194,9 +228,9 @@ class SimulatedActor:
             self._due_s = now_s
             return False
         self._sequence += 1
-        self._made += len(chunk)
+        self.made += len(chunk)
         self._due_s += len(chunk) / self._rate
-        if self._made >= (self._episodes + 1) * self._episode_steps:
+        if self.made >= (self._episodes + 1) * self._episode_steps:
             self._episodes += 1
             self._summaries.put(encode(self._summary()))
         return True
@@ -213,12 +247,13 @@ class SimulatedActor:
             epsilon=1.0,
             weights_version=0,
             mean_q=0.0,
+            num_robots=self._num_robots,
         )
 
     def _metrics(self) -> ActorMetrics:
         return replace(
             _NOT_SIMULATED,
-            robot_steps=self._made,
+            robot_steps=self.made,
             episodes=self._episodes,
             chunks=self.sender.chunks,
             inserts_acknowledged=self.sender.transitions,
@@ -230,18 +265,20 @@ class SimulatedActor:
 class SimulatedActors:
     """All simulated actors of one process: one thread for all, and one for each sender."""
 
-    def __init__(self, plan: Plan) -> None:
-        """Join the run; raises EndpointError if the endpoint does not answer."""
+    def __init__(self, plan: Plan, joined: Joined = lambda _number: None) -> None:
+        """Join the run, one after another; raises MrcdrlError if one cannot."""
         self._stop, self._sessions = StopSignal(), ExitStack()
         self._actors: list[SimulatedActor] = []
+        self._turn = 0
         chunks = episode_chunks(plan.config)
         try:
             for worker in plan.workers:
                 session = self._sessions.enter_context(Session(plan.transport))
-                bulk = self._sessions.enter_context(Session(plan.transport))
-                writer = TimedWriter(bulk, plan, worker, self._stop)
-                self._actors.append(SimulatedActor(plan, worker, chunks, session, writer))
-        except MrcdrlError:
+                writer = TimedWriter(session, plan, worker, self._stop)
+                actor = SimulatedActor(plan, worker, chunks, session, writer, self._stop)
+                self._actors.append(actor)
+                joined(len(self._actors))
+        except BaseException:
             self.close()
             raise
 
@@ -251,23 +288,34 @@ class SimulatedActors:
 
     def work(self, now_s: float) -> None:
         for actor in self._actors:
-            actor.work(now_s)
+            actor.spool(now_s)
+        self._turn = (self._turn + 1) % _TURNS
+        for actor in self._actors[self._turn :: _TURNS]:
+            actor.look()
 
-    def done(self) -> tuple[Counter[str], Float64Array]:
+    def drained(self) -> bool:
+        return all(actor.made == actor.sender.transitions for actor in self._actors)
+
+    def tally(self, seconds: float) -> Tally:
         counts: Counter[str] = Counter()
         insert_s: list[float] = []
+        weights_s: list[float] = []
         for actor in self._actors:
             writer, sender = actor.writer, actor.sender
             counts.update(actor.counts)
-            counts.update(transitions=sender.transitions, chunks=sender.chunks)
             counts.update(
+                made=actor.made,
+                transitions=sender.transitions,
+                chunks=sender.chunks,
                 requests=writer.requests,
                 throttled=writer.throttled,
                 unanswered=writer.unanswered,
+                waited_ms=round(1000 * actor.waited_s),
             )
-            counts.update(waited_ms=round(1000 * actor.waited_s))
             insert_s += [writer.insert_s.popleft() for _ in range(len(writer.insert_s))]
-        return counts, np.array(insert_s)
+            weights_s += actor.weights_s
+            actor.weights_s.clear()
+        return Tally(seconds, counts, np.array(insert_s), np.array(weights_s))
 
     def close(self) -> None:
         """End all actors; spooled chunks are dropped."""
@@ -275,6 +323,14 @@ class SimulatedActors:
         with ThreadPoolExecutor(max(1, len(self._actors))) as pool:
             list(pool.map(lambda actor: actor.sender.close(), self._actors))
         self._sessions.close()
+
+
+def published_s(weights: bytes) -> float:
+    """When a simulated learner published these weights, on this machine's monotonic clock.
+
+    It says so, in nanoseconds, in the place of its step. Raises WireError if they are no weights.
+    """
+    return 1e-9 * learner_step_of(weights)
 
 
 def episode_chunks(config: Config) -> list[Chunk]:

@@ -4,18 +4,18 @@ import threading
 from collections import Counter
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
-from time import time_ns
+from time import monotonic_ns, time_ns
 
 import numpy as np
 
-from mrcdrl.common.messages.trajectory import Float64Array, Priorities, Weights
+from mrcdrl.common.messages.trajectory import Priorities, Weights
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import SENT_AS, weights_to_bytes
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.common.transport import Session
 from mrcdrl.services.replay.client import PriorityWriter, ReplayReader
-from mrcdrl.services.tools.simulate.actors import Plan, answering, follow
+from mrcdrl.services.tools.simulate.actors import Plan, Tally, answering, follow, tell_joined
 
 
 def learn(plan: Plan, connection: Connection) -> None:
@@ -25,6 +25,7 @@ def learn(plan: Plan, connection: Connection) -> None:
         bulk = owned.enter_context(Session(plan.transport))
         learner = SimulatedLearner(plan, session, bulk)
         owned.callback(learner.close)
+        tell_joined(connection)(1)
         follow(connection, learner)
 
 
@@ -42,7 +43,7 @@ class SimulatedLearner:
         self._num_samples = 0
         self._stop = StopSignal()
         session.announce(keys.live("learner", plan.workers[0]))
-        self._weights = WeightsWriter(session, keys)
+        self._weights = WeightsWriter(session, keys, config.learner.publish_bytes_per_s)
         self._reader = ReplayReader.from_config(bulk, keys, config, self._stop)
         self._priorities = (
             PriorityWriter.from_config(bulk, keys, config, self._stop)
@@ -62,10 +63,15 @@ class SimulatedLearner:
         if now_s >= self._due_s:
             self._due_s += self._period_s
             self._version += 1
-            self._weights.publish(Weights.of(self._epoch, self._version, 0, self._payload))
+            weights = Weights.of(self._epoch, self._version, monotonic_ns(), self._payload)
+            self._weights.publish(weights)
 
-    def done(self) -> tuple[Counter[str], Float64Array]:
-        return Counter(published=self._version, samples=self._num_samples), np.empty(0)
+    def tally(self, seconds: float) -> Tally:
+        published = self._weights.publications
+        return Tally(seconds, Counter(published=published, samples=self._num_samples))
+
+    def drained(self) -> bool:
+        return True
 
     def close(self) -> None:
         self._stop.set()

@@ -106,26 +106,43 @@ class Load:
     insert_ms: float | None  # median
     cores: int
     busy: float | None  # of these cores, for any process
-    usage: dict[str, Usage]  # by process; actors-0 and so on simulate
+    usage: dict[str, Usage]  # by process
+    weights: float | None = None  # fraction of the publications that reached each actor
+    simulating: frozenset[str] = frozenset()  # processes that a real run would have elsewhere
 
 
 def bottleneck(load: Load) -> str:
-    """Name the bottleneck."""
+    """Name the bottleneck, with the figures that show it."""
+    late = 0.0 if load.weights is None else 1 - load.weights
     if math.isfinite(load.due) and load.accepted >= _ACCEPTED * load.due:
-        return "none: all transitions due were accepted"
+        if late <= 1 - _ACCEPTED:
+            return "none: all transitions due were accepted"
+        missed = f"weights: {late:.0%} of the publications were overtaken by newer ones"
+        return "; ".join(filter(None, (missed, _full(load))))
     if load.throttled > _THROTTLED:
         return "the rate limiter: the learner does not sample enough to admit more"
+    if (full := _full(load)) is not None:
+        return full
+    if load.insert_ms is None:
+        return "replay did not acknowledge anything"
+    return f"the round trip to replay: an acknowledgement takes {load.insert_ms:.1f} ms"
+
+
+def _full(load: Load) -> str | None:
+    """The cores that are full, if any are, and who fills them."""
     largest = max(load.usage, key=lambda name: load.usage[name].cores, default=None)
     if load.busy is not None and load.busy >= _BUSY * load.cores:
         used = ", ".join(f"{name} {usage.cores:.2f}" for name, usage in load.usage.items())
         ours = sum(usage.cores for usage in load.usage.values())
         others = max(load.busy - ours, 0.0)
-        return f"the machine's {load.cores} cores: {used}, all others {others:.2f}"
+        simulating = sum(load.usage[name].cores for name in load.simulating & load.usage.keys())
+        return (
+            f"the machine's {load.cores} cores: {used}, all others {others:.2f}; "
+            f"the simulation itself took {simulating:.2f}"
+        )
     if largest is not None and load.usage[largest].cores >= _FULL:
         cores = load.usage[largest].cores
         if largest.startswith("actors"):
             return f"the simulation: {largest} fills its core ({cores:.2f}); raise --processes"
         return f"{largest}: it fills a core ({cores:.2f})"
-    if load.insert_ms is None:
-        return "replay did not acknowledge anything"
-    return f"the round trip to replay: an acknowledgement takes {load.insert_ms:.1f} ms"
+    return None

@@ -8,12 +8,11 @@ import argparse
 import json
 import math
 import os
-import resource
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 
-from mrcdrl.common.config import DEFAULT_PRESET, load_config
+from mrcdrl.common.config import DEFAULT_PRESET, Config, load_config
 from mrcdrl.common.config.arguments import (
     Parser,
     add_config_flag,
@@ -23,6 +22,7 @@ from mrcdrl.common.config.arguments import (
 )
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.runtime.cores import available_cores
+from mrcdrl.common.runtime.open_files import allow_open_files
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.runs import add_run, run_path
 from mrcdrl.common.runtime.versions import all_versions
@@ -32,7 +32,8 @@ from mrcdrl.services.tools.simulate.simulation import Demand, simulation
 from mrcdrl.services.tools.simulate.target import NAME, joined, own
 
 ROBOT_STEPS_PER_S = 4300.0  # of an actor with a dedicated core: docs/profile.md
-_FILES = 4  # open files per actor, both here and in replay or the router: two connections' ends
+_FILES = 3  # open files per actor: a connection, shared memory, and a place for more
+_PEERS = 10  # besides the actors
 _SPARE_FILES = 200
 _SHOWN = (  # in the short help
     "arena.num_robots",
@@ -44,17 +45,18 @@ _SHOWN = (  # in the short help
 def main(argv: Sequence[str]) -> int:
     """Simulate; return the exit code. Figures go to stdout as JSON, progress to stderr."""
     arguments = _parse(argv)
-    _allow_open_files(arguments.actors)
+    _check_open_files(arguments.actors)
     stop = StopSignal().listen()
     demand = Demand(arguments.actors, arguments.rate, arguments.processes, arguments.publications)
     given = overrides(arguments)
     preset = arguments.config or DEFAULT_PRESET
     with ExitStack() as owned:
-        target = owned.enter_context(
-            joined(arguments.run, arguments.connect, given, stop)
-            if arguments.run
-            else own(load_config(preset, given), router=arguments.router)
-        )
+        if arguments.run:
+            target = owned.enter_context(joined(arguments.run, arguments.connect, given, stop))
+        else:
+            config = load_config(preset, given)
+            _check_places(arguments.actors, config)
+            target = owned.enter_context(own(config, router=arguments.router))
         simulated = owned.enter_context(simulation(demand, target, f"simulated-{os.getpid()}"))
         figures = simulated.run(60 * arguments.minutes, stop)
     result = {
@@ -145,17 +147,25 @@ def _frequency(text: str) -> float:
     return 0.0 if float(text) == 0 else _positive(text)
 
 
-def _allow_open_files(actors: int) -> None:
-    """Raise the limit of open files to what all sessions need, for the processes started here too.
+def _check_places(actors: int, config: Config) -> None:
+    """Raise ConfigError if the run's replay or router would not let all actors in."""
+    needed = actors + config.replay.shards + _PEERS
+    if config.transport.max_peers < needed:
+        raise ConfigError(
+            f"transport.max_peers {config.transport.max_peers} is too few for {actors} actors: "
+            f"give --transport.max_peers {needed} or more"
+        )
+
+
+def _check_open_files(actors: int) -> None:
+    """Allow as many open files as all sessions need, for the processes started here too.
 
     Raises ConfigError if the system allows fewer.
     """
     needed = _FILES * actors + _SPARE_FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if needed > hard != resource.RLIM_INFINITY:
+    allowed = allow_open_files(needed)
+    if allowed < needed:
         raise ConfigError(
-            f"{actors} actors need {needed} open files, but the system allows {hard}: raise that "
-            "(ulimit -Hn), or simulate fewer"
+            f"{actors} actors need {needed} open files, but the system allows {allowed}: raise "
+            "that (ulimit -Hn), or simulate fewer"
         )
-    if needed > soft != resource.RLIM_INFINITY:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))

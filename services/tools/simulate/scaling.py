@@ -92,6 +92,11 @@ class Pace:
         publications_per_s = updates_per_s / learner.publish_period
         if learner.publish_interval_s:
             publications_per_s = min(publications_per_s, 1 / learner.publish_interval_s)
+        if learner.publish_bytes_per_s:
+            fan_out_bytes = weights_bytes(config) * (actors + EVALUATORS)
+            publications_per_s = min(
+                publications_per_s, learner.publish_bytes_per_s / fan_out_bytes
+            )
         return cls(actors, min(admitted, actors * rate), publications_per_s)
 
 
@@ -247,4 +252,5 @@ def _episode() -> EpisodeSummary:
         epsilon=0.1,
         weights_version=10**5,
         mean_q=1.0,
+        num_robots=1,
     )

@@ -5,7 +5,6 @@ removed.
 """
 
 import os
-import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,12 +15,13 @@ from time import monotonic
 from mrcdrl.common.config import Config, TransportConfig, load_transport, to_toml
 from mrcdrl.common.errors import EndpointError, MrcdrlError
 from mrcdrl.common.runtime.files import RUN_CONFIG
-from mrcdrl.common.runtime.process import StopSignal, last_line, start_service
+from mrcdrl.common.runtime.process import StopSignal, end_service, last_line, start_service
 from mrcdrl.common.sync.joining import Joining, fetch_config
 from mrcdrl.common.transport import Session, free_endpoint
 
 NAME = "simulate"  # prefix of the names of runs whose data may be made up
 _START_S = 120.0
+_TRY_S = 1.0
 _END_S = 30.0
 
 
@@ -57,7 +57,7 @@ def own(config: Config, *, router: bool) -> Iterator[Target]:
         settings, services = Path(folder, RUN_CONFIG), dict[str, _Service]()
         settings.write_text(to_toml(config), "utf-8")
         if router:
-            flags = ["--listen", endpoint]
+            flags = ["--transport", str(settings), "--listen", endpoint]
             services["router"] = owned.enter_context(_Service("router", flags, Path(folder, "log")))
             services["router"].await_endpoint(transport)
         end = "--connect" if router else "--listen"
@@ -85,19 +85,14 @@ class _Service:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.process.terminate()
-        try:
-            self.process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        end_service(self.process, _END_S)
 
     def await_endpoint(self, transport: TransportConfig) -> None:
         """Wait until it listens; raises MrcdrlError, with its last log line, if it ends first."""
         deadline = monotonic() + _START_S
         while True:
             try:
-                Session(transport, open_timeout_s=0.0).close()
+                Session(transport, open_timeout_s=_TRY_S).close()
                 return
             except EndpointError:
                 if self.process.poll() is not None:

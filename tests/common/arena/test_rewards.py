@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrcdrl.common.arena import Scene
-from mrcdrl.common.arena.world.rewards import frame_rewards, on_target_px
+from mrcdrl.common.arena.world.rewards import drawn_to_occupied, frame_rewards, on_target_px
 from mrcdrl.common.config import ArenaConfig
 from mrcdrl.common.messages.trajectory import BoolArray, Float32Array
 
@@ -114,3 +114,29 @@ def test_success_is_all_within_delta_of_distinct_targets(
     assert success is (seated and not collided.any())
     assert (rewards == config.success_reward).all() == success
     assert (rewards[collided] == config.collision_reward).all()
+
+
+@pytest.mark.parametrize(
+    ("places", "expected"),
+    [
+        pytest.param([(175, 300), (425, 300)], [False, False], id="each-its-own"),
+        pytest.param([(175, 310), (175, 340)], [False, True], id="both-at-one"),
+        pytest.param([(100, 300), (425, 300)], [False, False], id="off-but-free"),
+        pytest.param([(175, 310), (290, 300)], [False, True], id="far-but-drawn"),
+        pytest.param([(175, 310), (310, 300)], [False, False], id="nearer-to-the-free-one"),
+        pytest.param([(175, 310), (175, 290)], [False, False], id="equally-near"),
+        pytest.param([(np.nan, np.nan), (175, 310)], [False, False], id="absent"),
+    ],
+)
+def test_a_target_is_occupied_by_the_robot_nearest_to_it(
+    places: list[tuple[float, float]], expected: list[bool]
+) -> None:
+    one = scene(*places)
+    assert drawn_to_occupied(one).tolist() == expected
+    many = Scene(np.stack([one.robots, one.robots[::-1]]), np.stack([one.targets] * 2))
+    assert drawn_to_occupied(many).tolist() == [expected, expected[::-1]]
+
+
+def test_an_absent_target_draws_nobody() -> None:
+    alone = scene((175, 310), (425, 330), targets=[(175.0, 300.0), (np.nan, np.nan)])
+    assert drawn_to_occupied(alone).tolist() == [False, True]

@@ -47,7 +47,7 @@ def test_the_short_help_has_what_people_use(capsys: pytest.CaptureFixture[str]) 
 
 @pytest.mark.parametrize("words", [["--help", "--config", "paper"], ["--config=paper", "-h"]])
 def test_defaults_are_those_that_hold(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert "default: 3" in shown(capsys, "--help")
+    assert "default: 5" in shown(capsys, "--help")
     text = shown(capsys, *words)
     assert "settings (defaults of preset paper)" in text
     assert "Rewards summed before the bootstrap (between 1 and 32; default: 1)" in text

@@ -14,6 +14,7 @@ import numpy as np
 
 from mrcdrl.common.messages.framing import join_set
 from mrcdrl.common.messages.trajectory import (
+    ArenaFrame,
     Chunk,
     EpisodeSummary,
     Evaluation,
@@ -82,7 +83,7 @@ MESSAGES: dict[str, Any] = {
     "lease_request": LeaseRequest("actor-0", STARTED_NS, -1, False, False),
     "lease_reply": LeaseReply(2, 2, 8, 15.0),
     "weights": Weights.of(STARTED_NS, 42, 4_200, b"a safetensors file"),
-    "episode": EpisodeSummary("actor-0", 3, 1, Outcome.TIMEOUT, 1000, 12.5, 2, 0.1, 41, 3.75),
+    "episode": EpisodeSummary("actor-0", 3, 1, Outcome.TIMEOUT, 1000, 12.5, 2, 0.1, 41, 3.75, 2),
     "evaluation": Evaluation(
         worker="evaluator-0",
         weights_epoch=STARTED_NS,
@@ -101,6 +102,24 @@ MESSAGES: dict[str, Any] = {
         mean_score=188.25,
         seed=1,
         wall_s=20.5,
+    ),
+    "arena_frame": ArenaFrame(
+        role="actor",
+        worker="actor-0",
+        arena=3,
+        episode=2,
+        frame=17,
+        weights_version=41,
+        epsilon=0.1,
+        robots=floats(100.0, 200.0, 0.5, 300.0, 400.0, -1.5).reshape(2, 3),
+        targets=floats(50.0, 60.0, 70.0, 80.0).reshape(2, 2),
+        obstacles=floats().reshape(0, 3),
+        q_values=floats(0.1, 0.2, 0.3, -0.1, 0.0, 0.1).reshape(2, 3),
+        actions=octets(2, 1),
+        collided=octets(0, 1),
+        outcome="",
+        view_px=2,
+        images=bytes.fromhex("780163606462666165630700005c001d"),  # 0 ... 7
     ),
     "stats": Stats(
         "actor", "actor-0", {"env_steps": 8_000.0, "epsilon": 0.1}, {"incarnation": str(STARTED_NS)}

@@ -26,7 +26,7 @@ from mrcdrl.common.runtime.names import is_name, printable
 from tests.common.messages.test_wire import CHUNK, SAMPLES, changed, floats
 
 EVALUATION = Evaluation("e", 7, 3, 100, 2, 10, 0.5, 0.25, 0.25, (0.2, 0.8), 5, 5, 0, 9, 1.5, 0, 1.0)
-EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
+EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5, 2)
 LEARNER = Stats("learner", "0", {"learner_steps": 5.0, "loss": 0.5}, {"python": "3.12.1"})
 WEIGHTS = Weights.of(1, 2, 20, b"payload")
 SOUND = (CHUNK, SAMPLES, EVALUATION, EPISODE, LEARNER, WEIGHTS)
@@ -97,7 +97,7 @@ ODD: list[tuple[Any, dict[str, Any], str]] = [
         for value in (-0.1, 1.5, NAN, INF)
     ],
     (SAMPLES, {"rewards": floats(1, NAN)}, "a reward is not finite"),
-    (SAMPLES, {"actions": [[2], b"\0\3"]}, "an action is not below 3"),
+    (SAMPLES, {"actions": [[2], b"\0\x40"]}, "an action is not below 64"),
     (SAMPLES, {"bootstrap_offsets": [[2], b"\1\0"]}, "offset is 0"),
     (SAMPLES, {"table_size": 0}, "table_size 0 is outside 1"),
 ]
@@ -127,6 +127,9 @@ def test_what_shows_that_learning_diverges_may_be_no_number() -> None:
     metrics = {"loss": NAN, "q_max": INF, "mean_q": -INF}
     found = decode(Stats, changed(LEARNER, metrics=metrics))
     assert found.metrics.keys() == metrics.keys()
+    for far in (1e308, -1e39):  # no learner computes that
+        with pytest.raises(WireError, match=r"metric loss .* is outside"):
+            decode(Stats, changed(LEARNER, metrics={"loss": far}))
     decode(EpisodeSummary, changed(EPISODE, mean_q=NAN))
 
 

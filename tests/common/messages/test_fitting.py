@@ -36,6 +36,7 @@ GOOD = Samples(
         ({"records": np.zeros((SIZE, WINDOW + 1, BYTES), np.uint8)}, "another run"),
         ({"records": np.zeros((1, WINDOW, BYTES), np.uint8)}, "another run"),
         ({"bootstrap_offsets": np.full(SIZE, 4, np.uint8)}, "exceeds agent.n_step"),
+        ({"actions": np.full(SIZE, 3, np.uint8)}, "action 3 where the arena of this run has 3"),
         ({"rewards": np.full(SIZE, -1e37, np.float32)}, "a return of 1e\\+37"),
     ],
 )

@@ -106,6 +106,7 @@ EPISODES = st.builds(
     epsilon=SHARES,
     weights_version=COUNTS,
     mean_q=st.floats(allow_nan=False),
+    num_robots=st.integers(1, 10),
 )
 
 
@@ -248,7 +249,7 @@ PRIORITIES = Priorities(np.array([7, 9], np.int64), np.array([0.5, 0.0], np.floa
 WISH = LeaseRequest("a", 1, 3, holds=True, ends=False)
 LEASE = LeaseReply(3, 2, 5, 15.0)
 STATS = Stats("actor", "actor-0", {"env_steps": 3.0})
-EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
+EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5, 2)
 _DEEP = b"\x91" * 1000 + b"\x90"  # a list in a list in a list …, as deep as msgpack unpacks
 
 

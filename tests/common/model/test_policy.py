@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from mrcdrl.common.arena import IDENTITY, SYMMETRIES
+from mrcdrl.common.config import load_config
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.trajectory import UInt8Array, Weights
-from mrcdrl.common.model.policy import FrameStack, Policy
+from mrcdrl.common.model.policy import FrameStack, Policy, averaged_symmetries, make_policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import weights_to_bytes
 
@@ -49,6 +51,47 @@ def test_exploration_is_uniform_and_as_frequent_as_epsilon() -> None:
     other = mixed.actions != mixed.q_values.argmax(axis=1)
     assert not other[:1500].any()
     assert other[1500:].mean() == pytest.approx(0.6 * 2 / 3, abs=0.05)
+
+
+def test_with_symmetric_views_alike_states_have_alike_values() -> None:
+    """The mean over a group does not change where the state is mapped by one of its members."""
+    network, observations = make_network(0), states(8)
+    alone, averaged = Policy(network), Policy(network, SYMMETRIES)
+    turns = np.arange(3, dtype=np.uint8)
+    views = [
+        alone.q_values(s.apply_to_images(observations))[:, s.apply_to_actions(turns)]
+        for s in SYMMETRIES
+    ]
+    np.testing.assert_allclose(averaged.q_values(observations), np.mean(views, 0), atol=1e-6)
+    for symmetry in SYMMETRIES:
+        mapped, back = symmetry.apply_to_images(observations), symmetry.apply_to_actions(turns)
+        np.testing.assert_allclose(
+            averaged.q_values(mapped)[:, back], averaged.q_values(observations), atol=1e-6
+        )
+    chosen = averaged.select_actions(observations, 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(chosen.q_values, averaged.q_values(observations))
+    one_view = averaged.averaging((IDENTITY,))
+    np.testing.assert_array_equal(one_view.q_values(observations), alone.q_values(observations))
+
+
+@pytest.mark.parametrize(("robots", "symmetries"), [(1, 8), (2, 4), (3, 2), (4, 8)])
+@pytest.mark.parametrize("most", [1, 4, 8])
+def test_the_views_are_those_of_the_layout(robots: int, symmetries: int, most: int) -> None:
+    settings = {"arena.num_robots": str(robots), "agent.symmetric_views": str(most)}
+    found = averaged_symmetries(load_config(None, settings, environ={}))
+    assert len(set(found)) == min(symmetries, most)
+    assert found[0] == IDENTITY
+    plain = load_config(None, {"arena.num_robots": str(robots)}, environ={})
+    assert averaged_symmetries(plain) == (IDENTITY,)
+
+
+def test_who_explores_acts_by_one_view() -> None:
+    config = load_config(None, {"agent.symmetric_views": "8"}, environ={})
+    judge, actor = make_policy(config), make_policy(config, averages=False)
+    actor.network.load_state_dict(judge.network.state_dict())
+    shape = (3, 4, config.arena.view_px, config.arena.view_px)
+    seen = np.random.default_rng(0).integers(256, size=shape, dtype=np.uint8)
+    assert np.abs(judge.q_values(seen) - actor.q_values(seen)).max() > 1e-3
 
 
 def test_the_same_generator_gives_the_same_actions() -> None:

@@ -83,6 +83,16 @@ def test_a_view_with_strides_is_read_as_it_lies() -> None:
         )
 
 
+def test_some_states_are_listed_as_they_are_among_all() -> None:
+    states, (weight, bias) = images(5, 4, 60, 0.1), parameters(4)
+    listed = nonzero_pixels(states)
+    assert listed is not None
+    for rows in (slice(0, 2), slice(2, 5), slice(4, 9), slice(1, 1)):
+        assert torch.equal(
+            first_layer(listed[rows], weight, bias), ours(states[rows], weight, bias)
+        )
+
+
 def test_images_that_are_not_mostly_black_are_left_to_torch() -> None:
     assert nonzero_pixels(images(2, 4, 60, MAX_NONZERO + 0.1)) is None
     assert nonzero_pixels(images(2, 4, 60, MAX_NONZERO - 0.1)) is not None

@@ -16,7 +16,12 @@ from mrcdrl.common.runtime.extras import PACKAGES, TRAINING, missing_extras, nam
 from mrcdrl.services.train.launcher import check_possible
 
 ROOT = Path(__file__).parents[3]
-DISTRIBUTIONS = {"cv2": "opencv-python-headless", "rerun": "rerun-sdk"}  # of other names
+DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "markdown_it": "markdown-it-py",
+    "rerun": "rerun-sdk",
+    "sse_starlette": "sse-starlette",
+}  # of other names
 NEEDING = {  # command lines that need an extra; the others need none
     "train": ["new"],
     "evaluate": ["nowhere"],
@@ -27,6 +32,7 @@ NEEDING = {  # command lines that need an extra; the others need none
     "actor": ["nowhere"],
     "learner": ["nowhere"],
     "evaluator": ["nowhere"],
+    "web": ["nowhere"],
 }
 _WITHOUT = """
 import sys
@@ -86,7 +92,7 @@ def test_extras_are_those_of_the_project() -> None:
         named = {name for name in named if not name.startswith("mrcdrl[")}
         assert {DISTRIBUTIONS.get(package, package) for package in packages} == named, extra
     assert listed["all"] == [f"mrcdrl[{','.join(TRAINING)}]"]
-    assert set(listed) - set(PACKAGES) == {"all", "dev", "fuzz"}
+    assert set(listed) - set(PACKAGES) == {"all", "dev", "docs", "fuzz"}
 
 
 def test_a_module_of_ours_that_is_missing_is_a_bug() -> None:

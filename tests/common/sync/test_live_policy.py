@@ -14,6 +14,7 @@ import torch
 from mrcdrl.common.config import Config, TransportConfig, load_config, to_toml
 from mrcdrl.common.errors import DeadlineError, EndpointError
 from mrcdrl.common.messages.trajectory import UInt8Array, Weights
+from mrcdrl.common.model.policy import Policy, averaged_symmetries
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import network_from_bytes, weights_to_bytes
 from mrcdrl.common.sync.live_policy import LivePolicy
@@ -86,7 +87,7 @@ def act_until(policy: LivePolicy, reached: Callable[[], bool]) -> None:
 
 
 def test_it_acts_on_stacks_by_the_newest_weights(run: Run) -> None:
-    network = network_from_bytes(run.publish(1))
+    same = Policy(network_from_bytes(run.publish(1)), averaged_symmetries(run.config))
     with LivePolicy(RUN, run.endpoint) as policy:
         assert (policy.version, policy.refused) == (1, 0)
         assert policy.config.arena == run.config.arena
@@ -94,7 +95,7 @@ def test_it_acts_on_stacks_by_the_newest_weights(run: Run) -> None:
         actions = [policy.act(frame) for frame in seen]
         stacks = [np.stack([seen[max(0, step - a)] for a in (3, 2, 1, 0)], 1) for step in range(6)]
         for states, chosen in zip(stacks, actions, strict=True):
-            expected = network(torch.from_numpy(states)).argmax(dim=1).numpy()
+            expected = same.q_values(states).argmax(axis=1)
             assert chosen.dtype == np.uint8
             np.testing.assert_array_equal(chosen, expected)
             np.testing.assert_array_equal(policy.act(states), expected)

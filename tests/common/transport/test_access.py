@@ -23,7 +23,7 @@ from tests.patience import PATIENCE_S
 
 _STATISTICS_S = 0.04  # apart: twice what the router's file asks for
 RUN = Keys("access")
-ROLES = ("replay", "learner", "actor", "evaluator", "status", "robot")
+ROLES = ("replay", "learner", "actor", "evaluator", "status", "viewer", "robot")
 SERVED = {
     "config": RUN.config,
     "leases": RUN.leases,
@@ -37,6 +37,7 @@ PUBLISHED = {
     "episodes": RUN.episodes("w"),
     "evaluation": RUN.evaluation("w"),
     **{f"stats of {role}": RUN.stats(role, "w") for role in ROLES},
+    **{f"arena of {role}": RUN.arena(role, "w") for role in ("actor", "evaluator")},
 }
 LIVE = {f"live {role}": RUN.live(role, "w") for role in ROLES}
 CLAIMS = {role: RUN.claim(role, "w", "1") for role in ROLES}
@@ -69,13 +70,13 @@ MAY = {
         announce=("live learner",),
     ),
     "actor": Row(
-        put=("episodes", "stats of actor"),
+        put=("episodes", "arena of actor", "stats of actor"),
         follow=("weights",),
         ask=("config", "leases", "insert", "weights"),
         announce=("live actor",),
     ),
     "evaluator": Row(
-        put=("evaluation", "stats of evaluator"),
+        put=("evaluation", "arena of evaluator", "stats of evaluator"),
         follow=("weights",),
         ask=("config", "weights"),
         announce=("live evaluator",),
@@ -83,6 +84,14 @@ MAY = {
     "status": Row(
         follow=("episodes", "evaluation", *(f"stats of {role}" for role in ROLES)),
         announce=("live status",),
+        watch=tuple(LIVE),
+    ),
+    "viewer": Row(
+        follow=(
+            *("weights", "episodes", "evaluation", "arena of actor", "arena of evaluator"),
+            *(f"stats of {role}" for role in ROLES),
+        ),
+        ask=("config", "weights"),
         watch=tuple(LIVE),
     ),
     "robot": Row(follow=("weights",), ask=("config", "weights")),

@@ -13,7 +13,14 @@ import pytest
 
 from mrcdrl.common.config import TransportConfig
 from mrcdrl.common.errors import DeadlineError, SharedMemoryError, ThrottledError
-from mrcdrl.common.transport import Request, Server, Session, free_endpoint, queries
+from mrcdrl.common.transport import (
+    Request,
+    Server,
+    Session,
+    free_endpoint,
+    queries,
+    shared_memory,
+)
 from mrcdrl.common.transport.compression import compressed
 from mrcdrl.common.transport.shared_memory import (
     LARGE_BYTES,
@@ -75,6 +82,28 @@ def test_buffers_of_dead_clients_are_forgotten() -> None:
     opened.open(other.address)
     with pytest.raises(SharedMemoryError):
         opened.open(first)
+
+
+def test_a_further_buffer_costs_the_same_however_many_are_mapped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked: list[Path] = []
+    opened, shared = OpenedBuffers(), [SharedBuffer(10) for _ in range(100)]
+    monkeypatch.setattr(shared_memory, "_is_buffer", lambda path: not looked.append(path))
+    for buffer in shared:
+        opened.open(buffer.address)
+    assert len(looked) <= 3 * len(shared)
+
+
+def test_all_buffers_of_dead_clients_are_forgotten_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, shared = OpenedBuffers(), [SharedBuffer(10) for _ in range(60)]
+    for buffer in shared[:40]:
+        opened.open(buffer.address)
+    dead = {Path(buffer.address.split()[2]) for buffer in shared[:40:2]}
+    monkeypatch.setattr(shared_memory, "_is_buffer", lambda path: Path(path.name) not in dead)
+    for buffer in shared[40:]:
+        opened.open(buffer.address)
+    assert opened._mapped.keys() == {s.address for s in (*shared[1:40:2], *shared[40:])}
 
 
 def foreign(buffer: SharedBuffer, **parts: str) -> str:

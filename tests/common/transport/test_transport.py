@@ -1,12 +1,14 @@
 """Real Zenoh sessions on loopback: every wait ends, every queue behaves as stated when full."""
 
 import logging
+import math
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, suppress
+from itertools import repeat
 from pathlib import Path
 
 import pytest
@@ -19,15 +21,19 @@ from mrcdrl.common.errors import (
     EndpointError,
     RefusedError,
     ThrottledError,
+    UnreachableError,
     WireError,
 )
 from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.process import StopSignal
+from mrcdrl.common.sync.claim import claim_name
 from mrcdrl.common.sync.weights import WeightsReader, WeightsWriter
 from mrcdrl.common.transport import (
     ROUTER_FILE,
     Client,
     PendingReply,
+    Priority,
     Publisher,
     Request,
     Server,
@@ -36,7 +42,7 @@ from mrcdrl.common.transport import (
 )
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.common.transport.publications import QueueSubscriber
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, eventually
 
 KEY = "mrcdrl/test/query"
 KEYS = Keys("test")
@@ -105,14 +111,6 @@ def until_served(session: Session, key: str, server: Server) -> None:
     while request is not None:  # those that were late
         request.reply(b"")
         request = server.take(0.1)
-
-
-def eventually(found: Callable[[], object]) -> None:
-    """Wait, without polling blindly, until it is so; fails at the deadline."""
-    waiter, deadline = threading.Event(), time.monotonic() + PATIENCE_S
-    while not found():
-        assert time.monotonic() < deadline, "did not happen"
-        waiter.wait(0.01)
 
 
 def answer_next(server: Server, answer: str, text: str) -> bytes:
@@ -445,6 +443,30 @@ def test_who_joins_late_gets_the_newest_weights_without_another_publication(
     assert reader.wait(StopSignal()) == weights(0, 2)
 
 
+def test_weights_are_published_as_often_as_their_readers_allow(network: Network) -> None:
+    """Two readers have nearly forever to receive the first; the end waits for nobody."""
+    session, stop = network.join(), StopSignal()
+    claim_name(session, KEYS, "actor", "a", stop)
+    claim_name(session, KEYS, "evaluator", "e", stop)
+    follower = network.join().latest_subscriber(KEYS.weights)
+    until_known(network.join().publisher(KEYS.weights), follower.take)
+    with closing(WeightsWriter(network.join(), KEYS, bytes_per_s=0.01)) as writer:
+        writer.publish(weights(0, 1))
+        eventually(lambda: writer.publications == 1 and writer._readers == 2)
+        writer.publish(weights(0, 2))
+        assert follower.take(PATIENCE_S) == encode(weights(0, 1))
+        assert follower.take(0.5) is None
+        assert WeightsReader(network.join(), KEYS).wait(StopSignal()) == weights(0, 2)
+    assert follower.take(PATIENCE_S) == encode(weights(0, 2))
+
+
+def test_without_readers_weights_are_published_at_once(network: Network) -> None:
+    with closing(WeightsWriter(network.join(), KEYS, bytes_per_s=0.01)) as writer:
+        for version in range(3):
+            writer.publish(weights(0, version))
+            eventually(lambda due=version + 1: writer.publications == due)
+
+
 def test_who_waits_gets_the_first_weights(network: Network, writer: WeightsWriter) -> None:
     reader = WeightsReader(network.join(), KEYS)
     with ThreadPoolExecutor(1) as other:
@@ -620,25 +642,194 @@ def test_a_router_listens_where_its_file_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "instead", "silent"),
+    ("accept_timeout", "max_peers", "silent"),
     [
-        ("accept_timeout: 5000", "accept_timeout: 900000", 300),  # there are places enough
-        ("accept_pending: 500", "accept_pending: 10", 30),  # or they are free again soon
+        ("900000", 2000, 300),  # there are places enough
+        ("5000", 10, 30),  # or they are free again soon
     ],
 )
 def test_silent_connections_keep_nobody_out(
-    given: str, instead: str, silent: int, tmp_path: Path
+    accept_timeout: str, max_peers: int, silent: int, tmp_path: Path
 ) -> None:
     file, endpoint = tmp_path / "router.json5", free_endpoint()
-    written = ROUTER_FILE.read_text("utf-8")
+    written, given = ROUTER_FILE.read_text("utf-8"), "accept_timeout: 20000"
     assert given in written
-    file.write_text(written.replace(given, instead), "utf-8")
+    file.write_text(written.replace(given, f"accept_timeout: {accept_timeout}"), "utf-8")
     host, port = endpoint.removeprefix("tcp/").split(":")
-    with Session(TransportConfig(listen=(endpoint,)), router_file=file), ExitStack() as opened:
+    listening = TransportConfig(listen=(endpoint,), max_peers=max_peers)
+    with Session(listening, router_file=file), ExitStack() as opened:
         for _ in range(silent):
             opened.enter_context(socket.create_connection((host, int(port)), timeout=PATIENCE_S))
         with Session(TransportConfig(connect=(endpoint,)), open_timeout_s=PATIENCE_S) as peer:
             assert "open" in repr(peer)
+
+
+class GatedLink:
+    """Passes one connection on to an endpoint; on the way back, as many bytes as are allowed."""
+
+    def __init__(self, endpoint: str, allowed: float = math.inf) -> None:
+        host, port = endpoint.removeprefix("tcp/").split(":")
+        self._far, self._left = (host, int(port)), allowed
+        self._changed = threading.Condition()
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listening.getsockname()[1]}"
+        self.passed = 0  # bytes, on the way back
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def allow(self, octets: float) -> None:
+        """Let so many more bytes pass."""
+        with self._changed:
+            self._left += octets
+            self._changed.notify_all()
+
+    def shut(self, after: int) -> None:
+        """Let only so many more bytes pass."""
+        with self._changed:
+            self._left = after
+
+    @property
+    def is_shut(self) -> bool:
+        return self._left == 0
+
+    def close(self) -> None:
+        self.allow(math.inf)
+        self._listening.close()
+
+    def _run(self) -> None:
+        near, _ = self._listening.accept()
+        far = socket.create_connection(self._far)
+        threading.Thread(target=self._pass_on, args=(near, far), daemon=True).start()
+        self._pass_back(far, near)
+
+    def _pass_on(self, near: socket.socket, far: socket.socket) -> None:
+        with near, far, suppress(OSError):
+            while data := near.recv(1 << 16):
+                far.sendall(data)
+
+    def _pass_back(self, far: socket.socket, near: socket.socket) -> None:
+        with near, far, suppress(OSError):
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._left > 0)
+                    most = int(min(self._left, 1 << 14))
+                if not (data := far.recv(most)):
+                    return
+                with self._changed:
+                    self._left -= len(data)
+                    self.passed += len(data)
+                near.sendall(data)
+
+
+def test_an_acknowledgement_overtakes_weights_on_one_session(tmp_path: Path) -> None:
+    """Only half of the weights can pass, and yet it comes."""
+    endpoint, file, half = free_endpoint(), tmp_path / "router.json5", 16 << 20
+    patient = ROUTER_FILE.read_text("utf-8").replace("_close: 5000000", "_close: 900000000")
+    file.write_text(patient, "utf-8")
+    config = TransportConfig(connect=(endpoint,), timeout_s=PATIENCE_S)
+    with (
+        Session(TransportConfig(listen=(endpoint,)), router_file=file) as router,
+        Session(config) as learner,
+        closing(GatedLink(endpoint)) as link,
+        Session(config.model_copy(update={"connect": (link.endpoint,)})) as actor,
+        ThreadPoolExecutor(2) as others,
+    ):
+        server, weights = router.server(KEY), learner.publisher(KEYS.weights, Priority.LOW)
+        client, latest = actor.client(KEY, "replay"), actor.latest_subscriber(KEYS.weights)
+        until_served(actor, KEY, server)
+
+        def arrived() -> bytes | None:
+            weights.put(b"small")
+            return latest.take(0.1)
+
+        eventually(arrived, "the subscription has reached the learner")
+        link.shut(after=1 << 16)
+        published = others.submit(weights.put, bytes(2 * half))
+        eventually(lambda: link.is_shut, "weights are on the way")
+        pending = client.ask(b"chunk")
+        answer_next(server, "reply", "stored")
+        link.allow(half)
+        assert pending.result() == b"stored"
+        link.allow(math.inf)
+        published.result()
+        eventually(lambda: len(latest.take(0.1) or b"") == 2 * half)
+
+
+def test_an_actor_hears_nothing_of_another_that_joins() -> None:
+    endpoint = free_endpoint()
+    config, stop = TransportConfig(connect=(endpoint,)), StopSignal()
+
+    def join(session: Session, name: str) -> None:
+        claim_name(session, KEYS, "actor", name, stop)
+        session.announce(KEYS.live("actor", name))
+        session.publisher(KEYS.stats("actor", name))
+        session.watched_publisher(KEYS.arena("actor", name))
+        session.client(KEYS.insert(), "replay")
+        WeightsReader(session, KEYS)
+
+    with Session(TransportConfig(listen=(endpoint,))) as router, ExitStack() as opened:
+        router.server(KEYS.insert())
+        presence = router.presence(KEYS.everyone())
+        link = opened.enter_context(closing(GatedLink(endpoint)))
+        actor = opened.enter_context(Session(TransportConfig(connect=(link.endpoint,))))
+        join(actor, "first")
+        eventually(lambda: len(presence.alive()) == 1)
+        before = link.passed
+        for number in range(20):
+            join(opened.enter_context(Session(config)), f"other-{number}")
+        eventually(lambda: len(presence.alive()) == 21)
+        # A token's key alone has 25 bytes; what may come in the meantime is to keep the link alive.
+        assert link.passed - before < 20 * 25
+
+
+def test_a_full_router_says_so_and_lets_in_who_waits(caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = free_endpoint()
+    config = TransportConfig(connect=(endpoint,))
+    with Session(TransportConfig(listen=(endpoint,), max_peers=2)), Session(config):
+        leaver = Session(config)
+        with pytest.raises(UnreachableError, match=f"{endpoint} .*all places .*max_peers.* taken"):
+            Session(config, open_timeout_s=0.0)
+        eventually(lambda: "2 peers have joined, as many as transport.max_peers" in caplog.text)
+        with ThreadPoolExecutor(1) as other:
+            waiting = other.submit(Session, config, open_timeout_s=PATIENCE_S)
+            eventually(lambda: "it is not a router; trying again" in caplog.text)
+            assert not waiting.done()
+            leaver.close()
+            with waiting.result(PATIENCE_S) as late:
+                assert "open" in repr(late)
+
+
+def test_all_come_back_to_a_router_that_was_restarted() -> None:
+    endpoint, peers = free_endpoint(), 50
+    config = TransportConfig(connect=(endpoint,))
+    listening = TransportConfig(listen=(endpoint,), max_peers=peers + 1)
+    router = Session(listening)
+    with ExitStack() as opened:
+        keys = {KEYS.live("actor", str(number)) for number in range(peers)}
+        for key in keys:
+            opened.enter_context(Session(config)).announce(key)
+        router.close()
+        with Session(listening), Session(config, open_timeout_s=PATIENCE_S) as watcher:
+            presence = watcher.presence(KEYS.everyone("actor"))
+            eventually(lambda: presence.alive() == keys, "all have announced themselves again")
+
+
+def test_a_lost_session_takes_no_second_place(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has long enough to come back before its successor joins."""
+    endpoint = free_endpoint()
+    config = TransportConfig(connect=(endpoint,))
+    listening = TransportConfig(listen=(endpoint,), max_peers=2)
+    monkeypatch.setattr("mrcdrl.common.transport.session.random_pauses", lambda: repeat(2.5))
+    router = Session(listening)
+    with Session(config) as one:
+        one.announce(KEYS.live("actor", "a"))
+        router.close()
+        caplog.clear()
+        with Session(listening) as restarted:
+            presence = restarted.presence(KEYS.everyone())
+            eventually(lambda: presence.alive(), "it has announced itself again")
+            assert "2 peers have joined" not in caplog.text
 
 
 @pytest.mark.parametrize("content", ["{mode: ", '{mode: "wanderer"}', "{nonsense: 1}"])

@@ -17,6 +17,7 @@ from mrcdrl.common.arena import (
 )
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import (
+    BoolArray,
     Chunk,
     EpisodeSummary,
     Float32Array,
@@ -24,9 +25,11 @@ from mrcdrl.common.messages.trajectory import (
     UInt8Array,
     Weights,
 )
+from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.model.policy import Policy, Selection
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import weights_to_bytes
+from mrcdrl.common.sync.broadcast import Broadcast, Moment
 from mrcdrl.services.actor.chunker import ChunkerConfig
 from mrcdrl.services.actor.collector import Collector
 
@@ -90,7 +93,9 @@ def make_network() -> QNetwork:
         return QNetwork("dqn", view_px=VIEW_PX)
 
 
-def collect(steps: int, *, prioritized: bool = False) -> Collected:
+def collect(
+    steps: int, *, prioritized: bool = False, broadcast: Broadcast | None = None
+) -> Collected:
     policy = WatchedPolicy(Policy(make_network()))
     chunking = ChunkerConfig("actor-0", 5, 0.99, N_STEP, STACK, 7, prioritized, reward_scale=0.1)
     arenas = CountingBatch(CONFIG.arena, range(ARENAS))
@@ -101,6 +106,7 @@ def collect(steps: int, *, prioritized: bool = False) -> Collected:
         make_codec(CONFIG.arena),
         policy,  # type: ignore[arg-type]
         np.random.default_rng(0),
+        broadcast,
     )
     chunks: list[Chunk] = []
     summaries: list[EpisodeSummary] = []
@@ -297,5 +303,47 @@ def test_absent_robots_bear_no_transitions() -> None:
             assert np.isfinite(chunk.records.view("<f4")[:, :3]).all()
         for summary in summaries:
             assert summary.score == pytest.approx(summary.frames), "a mean over those there"
+            assert summary.num_robots == present[summary.arena]
     assert numbers == {1, 3}
     assert transitions == expected == collector.robot_steps < 60 * collector.num_robots
+
+
+def test_who_is_watched_collects_the_same() -> None:
+    """What is shown are the frames that were played, and they have no effect."""
+    shown: list[tuple[int, bytes, bytes, str]] = []
+
+    class Shown(Broadcast):
+        """Keeps what a worker would show."""
+
+        watched = True
+
+        def __init__(self) -> None:
+            pass
+
+        def acts(self, moment: Moment, q_values: Float32Array, actions: UInt8Array) -> None:
+            assert q_values.shape == (ROBOTS, 3)
+            shown.append((moment.frame, moment.images.tobytes(), actions.tobytes(), ""))
+
+        def stepped(
+            self, collided: BoolArray, last: Moment | None, outcome: Outcome | None
+        ) -> None:
+            assert collided.shape == (ROBOTS,)
+            assert (last is None) == (outcome is None)
+            if last is not None and outcome is not None:
+                shown.append((last.frame, last.images.tobytes(), b"", outcome))
+
+    alone, watched = collect(STEPS), collect(STEPS, broadcast=Shown())
+    assert [encode(chunk) for chunk in watched.chunks] == [encode(c) for c in alone.chunks]
+    assert watched.summaries == alone.summaries
+    ends = [i for i, frame in enumerate(shown) if frame[3]]
+    assert len(ends) >= 2
+    lengths = [counting_frames(0, episode) for episode in range(len(ends))]
+    frames = [frame for frame, *_ in shown]
+    expected = [f for length in lengths for f in range(length + 1)]
+    assert frames[: len(expected)] == expected
+    for frame, images, _, outcome in shown[: ends[1] + 1]:
+        counters = decode_counters(
+            np.frombuffer(images, np.uint8).reshape(ROBOTS, VIEW_PX, VIEW_PX)
+        )
+        assert counters.step.tolist() == [frame] * ROBOTS
+        assert outcome in ("", "success", "timeout")

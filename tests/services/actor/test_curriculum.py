@@ -1,5 +1,7 @@
 """Which number of robots an actor plays next."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,18 @@ def test_at_first_all_numbers_make_as_many_transitions() -> None:
     for curriculum in (automatic(), Curriculum(CurriculumConfig(), ARENA)):
         np.testing.assert_allclose(curriculum.weights(0), [1 / 3] * 3)
         np.testing.assert_allclose(curriculum.chances(0), np.array([4, 2, 1]) / 7)
+
+
+@pytest.mark.parametrize("kind", ["schedule", "automatic"])
+def test_the_greatest_number_may_be_played_alone_at_first(
+    kind: Literal["schedule", "automatic"],
+) -> None:
+    after = Curriculum(CurriculumConfig(kind=kind), ARENA)
+    curriculum = Curriculum(CurriculumConfig(kind=kind, greatest_first_steps=10), ARENA)
+    for step in (0, 9):
+        np.testing.assert_array_equal(curriculum.weights(step), [0, 0, 1])
+        np.testing.assert_array_equal(curriculum.chances(step), [0, 0, 1])
+    np.testing.assert_array_equal(curriculum.weights(10), after.weights(10))
 
 
 def test_what_is_neither_solved_nor_hopeless_is_played_most() -> None:

@@ -17,8 +17,8 @@ from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.actor.lease import ALONE, ExplorationRank, LeaseClient
 from mrcdrl.services.replay.leases import LeaseTable
-from tests.patience import PATIENCE_S
-from tests.system.system_processes import REPOSITORY, Command, end_all, eventually, run_name
+from tests.patience import PATIENCE_S, eventually
+from tests.system.system_processes import REPOSITORY, Command, end_all, run_name
 
 RENEWED_S = 1.0  # as if leases were so short
 LEASE_S = 1000.0  # as they are

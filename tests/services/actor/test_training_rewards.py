@@ -12,6 +12,7 @@ from mrcdrl.common.arena import make_arenas, make_codec
 from mrcdrl.common.config import Config
 from mrcdrl.common.config.returns import largest_n_step_return
 from mrcdrl.common.messages.trajectory import (
+    BoolArray,
     Chunk,
     EpisodeSummary,
     Float64Array,
@@ -41,6 +42,7 @@ class Told:
     """An arena of one robot, whose distance is what a test says."""
 
     distance_px: float = 0.0
+    occupied: bool = False
     asked: int = 0
 
     def __len__(self) -> int:
@@ -49,6 +51,10 @@ class Told:
     def assigned_distances_px(self, arenas: Int64Array) -> Float64Array:
         self.asked += 1
         return np.full((len(arenas), 1), self.distance_px)
+
+    def drawn_to_occupied(self, arenas: Int64Array) -> BoolArray:
+        self.asked += 1
+        return np.full((len(arenas), 1), self.occupied)
 
 
 def step_of(reward: float, outcome: Outcome | None = None, *, collided: bool = False) -> TimeSteps:
@@ -178,6 +184,31 @@ def test_the_price_of_a_collision_follows_its_schedule() -> None:
     assert prices == [-5.0, -15.0, -25.0, -25.0]
     assert rewards.after(step_of(-5.0), 99)[0, 0] == -5.0
     assert not arena.asked, "without shaping nobody assigns targets"
+
+
+@pytest.mark.parametrize(
+    ("occupied", "reward", "outcome", "collided", "expected"),
+    [
+        (True, 0.8, None, False, 0.03),
+        (True, 0.8, Outcome.TIMEOUT, False, 0.03),
+        (True, 0.03, None, False, 0.03),  # too far to be paid
+        (False, 0.8, None, False, 0.8),
+        (True, -5.0, None, True, -5.0),
+        (True, -5.0, Outcome.COLLISION, True, -5.0),
+        (True, 200.0, Outcome.SUCCESS, False, 200.0),
+    ],
+)
+def test_a_target_of_another_robot_need_not_pay(
+    occupied: bool, reward: float, outcome: Outcome | None, collided: bool, expected: float
+) -> None:
+    for pays in (True, False):
+        config = config_of(shaping_per_px=0.0, occupied_targets_pay=pays)
+        arena = Told(occupied=occupied)
+        rewards = TrainingRewards(config, arena)  # type: ignore[arg-type]
+        rewards.start([0], 0)
+        found = rewards.after(step_of(reward, outcome, collided=collided), 0)[0, 0]
+        assert found == pytest.approx(reward if pays else expected)
+        assert bool(arena.asked) is not pays, "nobody looks where it does not matter"
 
 
 def optimal_values(config: Config, distances_px: list[float], *, plain: bool) -> Float64Array:

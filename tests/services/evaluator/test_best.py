@@ -1,14 +1,18 @@
 """The best weights are kept, over restarts too."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
+from mrcdrl.common import arena
+from mrcdrl.common.arena import Start
 from mrcdrl.common.config import load_config
 from mrcdrl.common.errors import CheckpointError
-from mrcdrl.common.messages.trajectory import Evaluation, Weights
-from mrcdrl.common.model.policy import Policy, make_policy
+from mrcdrl.common.messages.trajectory import Evaluation, Outcome, Weights
+from mrcdrl.common.model.policy import Policy, averaged_symmetries, make_policy
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_files import read_weights
 from mrcdrl.common.model.weights_io import SENT_AS, network_from_bytes, weights_to_bytes
@@ -58,12 +62,46 @@ def kept(path: Path) -> str:
     return payload.decode()
 
 
+@pytest.mark.parametrize(
+    ("probe", "succeeds", "played"),
+    [
+        (2, set(), 2),  # hopeless: the rest is not worth its time
+        (2, {3}, 2),  # nor is it known that a later one would succeed
+        (2, {1}, 5),
+        (0, set(), 5),
+        (5, set(), 5),
+        (9, {4}, 5),
+    ],
+)
+def test_an_evaluation_ends_early_if_no_probe_episode_succeeds(
+    monkeypatch: pytest.MonkeyPatch, probe: int, succeeds: set[int], played: int
+) -> None:
+    settings = {"arena.view_px": "32", "evaluator.episodes": "5"}
+    config = load_config("smoke", {**settings, "evaluator.probe_episodes": str(probe)}, environ={})
+    seen: list[Start] = []
+
+    def play(_config: object, part: Sequence[Start], *_: object, **__: object) -> list[MagicMock]:
+        numbers = range(len(seen), len(seen) + len(part))
+        seen.extend(part)
+        outcomes = [Outcome.SUCCESS if n in succeeds else Outcome.TIMEOUT for n in numbers]
+        return [MagicMock(outcome=outcome, frames=7, score=1.0) for outcome in outcomes]
+
+    monkeypatch.setattr("mrcdrl.services.evaluator.evaluator.play", play)
+    weights = Weights.of(0, 1, 10, weights_to_bytes(QNetwork("duel", view_px=32)))
+    found = WeightsEvaluator(config, "evaluator-0").evaluate(weights, lambda: True)
+    assert found is not None
+    assert found.episodes == played
+    assert found.success_rate == len([i for i in succeeds if i < played]) / played
+    starts = arena.test_starts(config.arena, 5, config.evaluator.seed)
+    assert repr(seen) == repr(list(starts[:played]))  # the same whatever the probe
+
+
 @pytest.mark.parametrize("restarts", [False, True])
 @pytest.mark.parametrize(
     ("offers", "expected"),
     [
         ([(0.0, 0)], 0),
-        ([(0.0, 0), (0.0, 0)], 0),
+        ([(0.0, 0), (0.0, 0)], 1),  # untrained weights are not the best of a run that was stopped
         ([(0.5, 90), (0.6, 200)], 1),
         ([(0.5, 90), (0.4, 10)], 0),
         ([(0.5, 90), (0.5, 80)], 1),
@@ -85,7 +123,8 @@ def test_more_successes_or_as_many_in_less_time_are_kept(
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "float16"])
 def test_the_kept_weights_give_the_values_that_were_evaluated(path: Path, precision: str) -> None:
     small = {"arena.view_px": "32", "learner.precision": "float32"}
-    evaluated = make_policy(load_config("smoke", small, environ={}))
+    config = load_config("smoke", small, environ={})
+    evaluated = make_policy(config)
     payload = weights_to_bytes(QNetwork("duel", view_px=32), SENT_AS[precision])
     weights = Weights.of(0, 1, 10, payload)
     evaluated.adopt(weights)
@@ -93,7 +132,7 @@ def test_the_kept_weights_give_the_values_that_were_evaluated(path: Path, precis
     kept_payload, manifest = read_weights(path)
     assert manifest["sha256"] == weights.digest
     states = np.random.default_rng(0).integers(0, 256, (5, 4, 32, 32), dtype=np.uint8)
-    loaded = Policy(network_from_bytes(kept_payload))
+    loaded = Policy(network_from_bytes(kept_payload), averaged_symmetries(config))
     np.testing.assert_array_equal(loaded.q_values(states), evaluated.q_values(states))
 
 

@@ -1,7 +1,6 @@
 """The evaluator, in a thread of the test: which weights it evaluates, and what it tells."""
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -21,7 +20,7 @@ from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.sync.stats import StatsReporter
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.services.evaluator.evaluator import BestWeights, Evaluator
-from tests.patience import PATIENCE_S
+from tests.patience import eventually
 
 SMALL = {
     "arena.view_px": "32",
@@ -45,12 +44,6 @@ def weights(epoch: int, version: int, view_px: int = 32) -> bytes:
     return encode(Weights.of(epoch, version, 10 * version, weights_to_bytes(network)))
 
 
-def eventually(reached: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not reached():
-        assert time.monotonic() < deadline
-
-
 def test_each_frame_is_work_and_only_the_first_may_take_minutes(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -59,7 +52,7 @@ def test_each_frame_is_work_and_only_the_first_may_take_minutes(
     monkeypatch.setattr(StatsReporter, "publish_if_due", StatsReporter.publish)
     pulses: list[Pulse] = []
 
-    def play(*_: object, keep_going: Callable[[int], bool]) -> None:
+    def play(*_: object, keep_going: Callable[[int], bool], **__: object) -> None:
         for frame in range(3):
             keep_going(frame)
             pulses.append(Pulse.read(path))

@@ -19,14 +19,22 @@ from mrcdrl.common.arena import (
 )
 from mrcdrl.common.arena.controllers import make_controller
 from mrcdrl.common.config import ArenaConfig
-from mrcdrl.common.messages.trajectory import Outcome, TimeStep, UInt8Array
+from mrcdrl.common.messages.trajectory import (
+    BoolArray,
+    Float32Array,
+    Outcome,
+    TimeStep,
+    UInt8Array,
+)
 from mrcdrl.common.model.policy import Policy
 from mrcdrl.common.model.q_network import QNetwork
+from mrcdrl.common.sync.broadcast import Broadcast, Moment
 from mrcdrl.services.evaluator.trial import (
     ControllerPlayer,
     EpisodeResult,
     Player,
     PolicyPlayer,
+    Show,
     play,
 )
 
@@ -187,3 +195,39 @@ def test_it_ends_when_told_to_and_says_how_far_it_is() -> None:
     assert play(CONFIG, starts, SteadyPlayer(STRAIGHT), keep_going=keep_going) is None
     assert told[0] == 0
     assert told[-1] == 2
+
+
+def test_who_is_watched_plays_the_same() -> None:
+    """One arena is shown, frame by frame, with what its policy saw, and its results stay."""
+    shown: list[tuple[int, str]] = []
+    starts = starts_of(CONFIG, 6, 3)
+
+    class Shown(Broadcast):
+        """Keeps what an evaluator would show."""
+
+        watched = True
+
+        def __init__(self) -> None:
+            pass
+
+        def acts(self, moment: Moment, q_values: Float32Array, actions: UInt8Array) -> None:
+            assert moment.images.shape == (2, CONFIG.view_px, CONFIG.view_px)
+            np.testing.assert_array_equal(q_values.argmax(axis=1), actions)
+            shown.append((moment.frame, ""))
+
+        def stepped(
+            self, collided: BoolArray, last: Moment | None, outcome: Outcome | None
+        ) -> None:
+            if last is not None and outcome is not None:
+                shown.append((last.frame, outcome))
+
+    alone, player = play(CONFIG, starts, by_policy(0.0)), by_policy(0.0)
+    watched = play(CONFIG, starts, player, show=Show(Shown(), player, 3))
+    assert watched is not None
+    assert alone is not None
+    assert [(r.outcome, r.frames, r.score) for r in watched] == [
+        (r.outcome, r.frames, r.score) for r in alone
+    ]
+    first = watched[0]
+    assert shown[: first.frames] == [(frame, "") for frame in range(first.frames)]
+    assert shown[first.frames] == (first.frames, first.outcome)

@@ -85,6 +85,44 @@ def test_munchausen_does_what_it_does_in_the_plain_step(
         assert_near(without, expected)
 
 
+@pytest.mark.parametrize("nonzero", [1.0, 0.05])
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("kind", ["duel", "dqn"])
+def test_what_is_computed_ahead_changes_no_number(kind: Kind, nonzero: float, threads: int) -> None:
+    """Also where the target network changes between: what is known of the old one is left."""
+    agent = AgentConfig(kind=kind, target_period=2, optimizer_epsilon=1e-2)
+    given = [darkened(batch, nonzero) for batch in batches(5)]
+
+    def learner() -> Learner:
+        return Learner(agent, FLOAT32, stack=4, view_px=VIEW_PX, threads=threads)
+
+    plain, fast, beside = learner(), learner(), make_learner(agent)
+    ahead = [beside.ahead(batch) for batch in given[:4]]
+    assert all(batch.ahead for batch in ahead)
+    ahead.append(given[4])
+    for batch, known in zip(given, ahead, strict=True):
+        expected, found = plain.step(batch), fast.step(known)
+        torch.testing.assert_close(found.td_errors, expected.td_errors, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(found.loss, expected.loss, rtol=1e-4, atol=1e-6)
+
+
+def test_nothing_is_computed_ahead_where_all_threads_share_a_batch() -> None:
+    learner = Learner(AgentConfig(), FLOAT32, stack=4, view_px=VIEW_PX, threads=2)
+    assert learner.ahead(random_batch()).ahead is None
+
+
+def test_values_known_ahead_are_taken() -> None:
+    learner, batch = make_learner(AgentConfig(kind="dqn")), random_batch()
+    known = learner.ahead(batch)
+    assert known.ahead is not None
+    other = dataclasses.replace(known.ahead, next_q=known.ahead.next_q + 1.0)
+    moved_by = (
+        learner.step(dataclasses.replace(batch, ahead=other)).td_errors
+        - make_learner(AgentConfig(kind="dqn")).step(batch).td_errors
+    )
+    torch.testing.assert_close(moved_by, batch.discount, rtol=1e-3, atol=1e-4)
+
+
 def darkened(batch: Batch, nonzero: float) -> Batch:
     """The batch with some of its images' pixels left, the others black."""
     generator = torch.Generator().manual_seed(0)

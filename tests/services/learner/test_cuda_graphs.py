@@ -6,6 +6,7 @@ that stay where they are: all but the capture itself is what runs on a GPU.
 
 import dataclasses
 import logging
+import threading
 from pathlib import Path
 from typing import Literal
 from unittest.mock import MagicMock
@@ -25,6 +26,7 @@ from mrcdrl.services.learner.prefetch import Prefetcher
 from mrcdrl.services.learner.step import Update
 from mrcdrl.services.learner.training_loop import run
 from mrcdrl.services.learner.weights_publisher import WeightsPublisher
+from tests.patience import PATIENCE_S
 from tests.services.learner.test_learner import FLOAT32, VIEW_PX, random_batch
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -190,6 +192,29 @@ def test_batches_that_wait_are_given_together() -> None:
     prefetcher = Prefetcher(reader, lambda sampled: sampled, depth=5, stop=stop)  # type: ignore[arg-type, return-value]
     prefetcher.close()  # once all five wait
     assert [prefetcher.next(0.0, most) for most in (2, 1, 4, 4)] == [[0, 1], [2], [3, 4], []]
+
+
+def test_a_part_of_the_step_is_computed_ahead_while_a_batch_waits() -> None:
+    stop, samples = StopSignal(), iter(range(1, 4))
+    reader = MagicMock()
+    reader.sample.side_effect = lambda: next(samples, None)
+    prefetcher = Prefetcher(reader, lambda sampled: sampled, 5, stop, lambda batch: -batch)  # type: ignore[arg-type, return-value, operator]
+    prefetcher.close()
+    assert prefetcher.next(0.0, 3) == [1, -2, -3]
+
+
+def test_a_learner_that_waits_gets_its_batch_at_once() -> None:
+    """Each is sampled only when the one before has been taken."""
+    stop, samples, taken = StopSignal(), iter(range(1, 4)), threading.Semaphore()
+    reader = MagicMock()
+    reader.sample.side_effect = lambda: taken.acquire(timeout=PATIENCE_S) and next(samples, None)
+    prefetcher = Prefetcher(reader, lambda sampled: sampled, 5, stop, lambda batch: -batch)  # type: ignore[arg-type, return-value, operator]
+    found = []
+    for _ in range(3):
+        found += prefetcher.next(PATIENCE_S)
+        taken.release()
+    prefetcher.close()
+    assert found == [1, 2, 3]
 
 
 def test_what_an_update_told_stays_after_the_next() -> None:

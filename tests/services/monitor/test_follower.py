@@ -19,7 +19,7 @@ from tests.patience import PATIENCE_S
 
 KEYS = Keys("followed")
 CONFIG = Config(run=RunConfig(target_success_rate=0.9))
-EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5)
+EPISODE = EpisodeSummary("a", 0, 1, Outcome.SUCCESS, 9, 1.5, 0, 0.1, 3, 2.5, 2)
 
 
 def learner(version: float) -> Stats:

@@ -11,7 +11,7 @@ from mrcdrl.services.monitor.phase import Phase, progress
 from mrcdrl.services.monitor.screen import plain_line
 from mrcdrl.services.monitor.service_table import figures, heard
 from mrcdrl.services.monitor.state import RunState
-from mrcdrl.services.status.main import status
+from mrcdrl.services.monitor.status import status
 
 CONFIG = load_config("quick", {"replay.min_size": "5000"}, {})
 BUSY = {DOING: COMPILING}

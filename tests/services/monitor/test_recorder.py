@@ -3,25 +3,38 @@
 import json
 import math
 import os
+import struct
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
 
 from mrcdrl.common.config import load_config
+from mrcdrl.common.config.returns import largest_return
 from mrcdrl.common.errors import RunDirectoryError
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
 from mrcdrl.common.runtime.files import atomic_write
-from mrcdrl.services.monitor.recorder import Recorder
-from mrcdrl.services.monitor.records import read_episodes, read_evaluations, read_last_metrics
+from mrcdrl.services.monitor import records
+from mrcdrl.services.monitor.recorder import RESULTS, Recorder
+from mrcdrl.services.monitor.records import (
+    read_episodes,
+    read_evaluations,
+    read_last_metrics,
+    read_latest_metrics,
+)
 from mrcdrl.services.monitor.state import RunState
 from mrcdrl.services.monitor.stopping import StoppingRule
 
 CONFIG = load_config("quick", environ={})
+PICTURE = Path(__file__).parents[3] / "docs" / "images" / "renderers.png"
 
 
 def episode(number: int, mean_q: float = 2.0) -> EpisodeSummary:
     outcome = Outcome.SUCCESS if number % 4 else Outcome.TIMEOUT
-    return EpisodeSummary("actor-0", 1, number, outcome, 99, 150.5, 1, 0.1, 5, mean_q)
+    return EpisodeSummary("actor-0", 1, number, outcome, 99, 150.5, 1, 0.1, 5, mean_q, 2)
 
 
 def evaluation(rate: float, step: int) -> Evaluation:
@@ -74,6 +87,76 @@ def test_tensorboard_events_are_written(tmp_path: Path) -> None:
     for tag in ("training/score", "training/successes_per_100", "training/mean_q",
                 "evaluation/success_rate", "rates/robot_steps_per_s", "learner/loss"):  # fmt: skip
         assert tag.encode() in content
+
+
+def summaries(run_dir: Path) -> list[tuple[int, Any]]:
+    """Step and value of every event, as TensorBoard reads them."""
+    found = []
+    for path in sorted((run_dir / "tensorboard").iterdir()):
+        data, at = path.read_bytes(), 0
+        while at < len(data):
+            (length,) = struct.unpack_from("<Q", data, at)
+            event = Event.FromString(data[at + 12 : at + 12 + length])
+            found += [(event.step, value) for value in event.summary.value]
+            at += 16 + length
+    return found
+
+
+def test_tensorboard_is_given_histograms_and_no_bins(tmp_path: Path) -> None:
+    state, scale = RunState(CONFIG), largest_return(CONFIG)
+    bins = {f"q_bin_{i}": 0.1 for i in range(10)} | {f"td_error_bin_{i}": 0.1 for i in range(10)}
+    metrics = {"learner_steps": 7.0, "q_min": -3 * scale, "q_max": 2.0} | bins
+    with Recorder(tmp_path, CONFIG) as recorder:
+        for second in range(3):  # the same bins thrice: they are sent now and then
+            state.observe_stats(Stats("learner", "0", metrics), second)
+            recorder.record_metrics(state, second)
+        for odd in ({"q_bin_0": 1e300}, {"q_bin_0": 0.2, "q_max": math.nan}):
+            state.observe_stats(Stats("learner", "0", metrics | odd), 3)
+            recorder.record_metrics(state, 3)
+    found = [(step, v) for step, v in summaries(tmp_path) if v.HasField("histo")]
+    (step, q), (_, errors) = found
+    assert (step, q.tag, errors.tag) == (7, "learner/q", "learner/td_error")
+    assert (q.histo.min, q.histo.max) == (-3 * scale, scale)
+    assert list(q.histo.bucket_limit) == pytest.approx(
+        [i / 4 * scale for i in range(-4, 5)] + [scale]
+    )
+    assert list(q.histo.bucket) == [0.1] * 10
+    assert errors.histo.bucket_limit[0] == pytest.approx(scale / 1e4)
+    assert not [v.tag for _, v in summaries(tmp_path) if "_bin" in v.tag]
+
+
+def test_tensorboard_is_given_settings_the_result_and_pictures(tmp_path: Path) -> None:
+    gif = b"GIF89a" + struct.pack("<HH", 300, 200) + b"the rest"
+    with Recorder(tmp_path, CONFIG) as recorder:
+        state = RunState(CONFIG)
+        for rate in (0.9, 0.4):
+            recorder.record_evaluation(state.observe_evaluation(evaluation(rate, 10), 1.0))
+        recorder.record_metrics(state, 1.0)
+        recorder.write_summary(state, 60, "time limit reached (1 min)")
+        (tmp_path / "training.png").write_bytes(PICTURE.read_bytes())
+        (tmp_path / "trajectories.png").write_bytes(b"cut off")
+        (tmp_path / "evaluation.gif").write_bytes(gif)
+        recorder.record_pictures()
+    found = {value.tag: value for _, value in summaries(tmp_path)}
+    text = found["configuration/text_summary"].tensor.string_val[0].decode()
+    assert "    gamma = 0.99" in text.splitlines()
+    start = HParamsPluginData.FromString(
+        found["_hparams_/session_start_info"].metadata.plugin_data.content
+    )
+    given = start.session_start_info.hparams
+    assert given["agent.gamma"].number_value == 0.99
+    assert given["agent.kind"].string_value == "duel"
+    assert not [name for name in given if name.startswith("transport")]
+    compared = HParamsPluginData.FromString(
+        found["_hparams_/experiment"].metadata.plugin_data.content
+    ).experiment.metric_infos
+    assert [info.name.tag for info in compared] == list(RESULTS)
+    assert found["result/best_success_rate"].simple_value == pytest.approx(0.9)
+    assert found["result/last_success_rate"].simple_value == pytest.approx(0.4)
+    assert found["run/training"].image.encoded_image_string == PICTURE.read_bytes()
+    film = found["run/evaluation"].image
+    assert (film.width, film.height, film.encoded_image_string) == (300, 200, gif)
+    assert "run/trajectories" not in found
 
 
 def test_a_resumed_run_appends_and_knows_its_past(tmp_path: Path) -> None:
@@ -192,3 +275,23 @@ def test_atomic_write_leaves_the_new_content_and_nothing_beside_it(tmp_path: Pat
     with pytest.raises(OSError, match="directory"):
         atomic_write(tmp_path, b"data")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_episodes_of_a_version_that_recorded_no_number_of_robots_are_read(tmp_path: Path) -> None:
+    line = {"time_s": 1.0, "learner_steps": 5} | asdict(episode(1))
+    del line["num_robots"]
+    (tmp_path / "episodes.jsonl").write_text(json.dumps(line) + "\n")
+    (read,) = read_episodes(tmp_path)
+    assert read.episode == replace(episode(1), num_robots=0)
+
+
+def test_the_latest_metrics_are_read_without_those_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = [f'{{"time_s": {second}}}\n' for second in range(500)]
+    (tmp_path / "metrics.jsonl").write_text("".join([*lines, "\0\0\n", '{"time_s": 5']))
+    parsed: list[bytes] = []
+    loads = records.json.loads
+    monkeypatch.setattr(records.json, "loads", lambda line: parsed.append(line) or loads(line))
+    assert read_latest_metrics(tmp_path, 2) == [{"time_s": 498}, {"time_s": 499}]
+    assert len(parsed) == 3

@@ -35,7 +35,7 @@ def busy_state(num_actors: int) -> RunState:
     state.observe_presence("evaluator", "0", alive=False)
     for number in range(1_000):
         outcome = Outcome.SUCCESS if number % 10 * 100 < number else Outcome.TIMEOUT
-        summary = EpisodeSummary("actor-0", 0, number, outcome, 99, 150.0, 1, 0.1, 5, 2.0)
+        summary = EpisodeSummary("actor-0", 0, number, outcome, 99, 150.0, 1, 0.1, 5, 2.0, 2)
         state.observe_episode(summary)
     for k in range(14):
         rate = k / 14

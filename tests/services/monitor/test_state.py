@@ -22,7 +22,7 @@ def config(**overrides: str) -> Config:
 
 
 def episode(outcome: Outcome = Outcome.SUCCESS, number: int = 0) -> EpisodeSummary:
-    return EpisodeSummary("actor-0", 0, number, outcome, 100, 150.0, 1, 0.1, 5, 2.0)
+    return EpisodeSummary("actor-0", 0, number, outcome, 100, 150.0, 1, 0.1, 5, 2.0, 2)
 
 
 def evaluation(rate: float, version: int = 1) -> Evaluation:

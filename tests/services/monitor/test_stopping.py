@@ -12,7 +12,7 @@ WON, LOST = Outcome.SUCCESS, Outcome.COLLISION
 
 
 def episode(outcome: Outcome) -> EpisodeSummary:
-    return EpisodeSummary("actor-0", 0, 0, outcome, 100, 150.0, 1, 0.1, 5, 2.0)
+    return EpisodeSummary("actor-0", 0, 0, outcome, 100, 150.0, 1, 0.1, 5, 2.0, 2)
 
 
 def evaluation(

@@ -23,7 +23,7 @@ from mrcdrl.services.monitor.stopping import StoppingRule
 from mrcdrl.services.monitor.watching import Watching
 
 CONFIG = load_config("smoke", environ={})
-EPISODE = EpisodeSummary("actor-0", 1, 1, Outcome.SUCCESS, 99, 150.5, 1, 0.1, 5, 2.0)
+EPISODE = EpisodeSummary("actor-0", 1, 1, Outcome.SUCCESS, 99, 150.5, 1, 0.1, 5, 2.0, 2)
 EVALUATION = Evaluation(
     "e", 1, 1, 50, 2, 100, 0.5, 0.5, 0.0, (0.2, 1.0), 9.0, 9.0, 4.0, 110.0, 150.0, 1, 20.0
 )

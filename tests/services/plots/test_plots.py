@@ -28,7 +28,7 @@ def record(run_dir: Path, num_episodes: int, num_evaluations: int) -> None:
     with Recorder(run_dir, CONFIG) as recorder:
         for number in range(num_episodes):
             outcome = Outcome.SUCCESS if number % 7 < number / 60 else Outcome.COLLISION
-            episode = EpisodeSummary("a", 0, number, outcome, 99, 1.0 * number, 1, 0.1, 5, 2.0)
+            episode = EpisodeSummary("a", 0, number, outcome, 99, 1.0 * number, 1, 0.1, 5, 2.0, 2)
             state.observe_episode(episode)
             recorder.record_episode(episode, state, 0.5 * number)
         for k in range(num_evaluations):

@@ -28,7 +28,7 @@ def settings(**replay: object) -> Config:
     """A small prioritized table."""
     small = {"capacity": 500, "min_size": 64, "segment_bytes": 4000, "sampler": "prioritized"}
     given = {f"replay.{name}": str(value) for name, value in {**small, **replay}.items()}
-    return load_config("smoke", given, environ={})
+    return load_config("smoke", {"agent.n_step": "3", **given}, environ={})
 
 
 CONFIG = settings()

@@ -21,8 +21,8 @@ def begun(tmp_path: Path) -> list[str]:
 def test_replay_of_other_transitions_is_refused(
     begun: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(RunDirectoryError, match=r"agent\.n_step is 5 here and 3 in .*stack"):
-        Serving.from_argv([*begun, "--agent.n_step", "5"])
+    with pytest.raises(RunDirectoryError, match=r"agent\.n_step is 7 here and 5 in .*stack"):
+        Serving.from_argv([*begun, "--agent.n_step", "7"])
     monkeypatch.setenv("MRCDRL_ARENA__NUM_ROBOTS", "3")
     for flags in ([], ["--config", "smoke"]):  # as containers are given it
         with pytest.raises(RunDirectoryError, match=r"arena\.num_robots is 3 here and 2 in"):

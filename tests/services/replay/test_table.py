@@ -314,7 +314,7 @@ def test_memory_is_the_rows_and_the_columns() -> None:
 
 
 def test_a_return_that_no_arena_gives_is_refused() -> None:
-    config = load_config("smoke", {"arena.success_reward": "10"}, environ={})
+    config = load_config("smoke", {"arena.success_reward": "10", "agent.n_step": "3"}, environ={})
     table, chunk = Table.from_config(config), harness.make_chunk(5)
     table.insert(chunk)
     most = largest_n_step_return(config)
@@ -332,7 +332,7 @@ def test_a_return_that_no_arena_gives_is_refused() -> None:
 
 def test_one_priority_cannot_take_over_the_sampling() -> None:
     """Whether it comes with a chunk or as an update; sane ones are taken as they are."""
-    config = load_config("smoke", {"replay.sampler": "prioritized"}, environ={})
+    config = harness.settings()
     table, exponent = Table.from_config(config), config.replay.priority_exponent
     sane = largest_return(config)
     for number, priority in enumerate((sane, 1e38)):

@@ -19,12 +19,14 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.monitor.follower import Follower
+from mrcdrl.services.monitor.recall import recall
 from mrcdrl.services.monitor.recorder import Recorder
 from mrcdrl.services.monitor.run_directory import RunDirectory
 from mrcdrl.services.monitor.screen import plain_line
 from mrcdrl.services.monitor.state import RunState
+from mrcdrl.services.monitor.status import status
 from mrcdrl.services.monitor.stopping import StoppingRule
-from mrcdrl.services.status.main import join, last_seen, listen, parser, recall, status
+from mrcdrl.services.status.main import join, last_seen, listen, parser
 
 
 def test_status_without_processes() -> None:

@@ -13,13 +13,13 @@ import pytest
 
 from mrcdrl.common.config import Config
 from mrcdrl.common.errors import ConfigError
-from mrcdrl.common.messages.trajectory import Evaluation
-from mrcdrl.services.monitor.records import EvaluationRecord, record_line
+from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome
+from mrcdrl.services.monitor.records import EpisodeRecord, EvaluationRecord, record_line
 from mrcdrl.services.monitor.stopping import stopped
 from mrcdrl.services.tools.experiment import grid as grid_module
 from mrcdrl.services.tools.experiment import main as main_module
 from mrcdrl.services.tools.experiment import runner
-from mrcdrl.services.tools.experiment.cell import CellFiles, State, lock
+from mrcdrl.services.tools.experiment.cell import CellFiles, State, hundreds, lock
 from mrcdrl.services.tools.experiment.grid import Cell, read_grid
 from mrcdrl.services.tools.experiment.main import main, time_left
 from mrcdrl.services.tools.experiment.table import table
@@ -49,11 +49,15 @@ here = Path(__file__).parent
 with (here / "calls").open("a") as calls:
     calls.write(json.dumps(sys.argv[1:]) + "\\n")
 if sys.argv[1] == "evaluate":
-    flags = dict(zip(sys.argv[3::2], sys.argv[4::2]))
+    words = [word for word in sys.argv if word != "--values"]
+    flags = dict(zip(words[3::2], words[4::2]))
     test = {"episodes": int(flags["--episodes"]), "seed": int(flags["--seed"])}
+    if "--values" in sys.argv:
+        test["values"] = {"overestimation": 2.0}
     print(json.dumps({**test, "success_rate": 0.5}))
     sys.exit()
-flags = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+words = [word for word in sys.argv if word not in ("--no-plots", "--no-web")]
+flags = dict(zip(words[2::2], words[3::2]))
 name = flags.get("--name") or flags["--resume"]
 run = Path(flags["--run-dir"], name)
 if (here / "fails").exists() and (here / "fails").read_text() in name:
@@ -183,6 +187,11 @@ WRONG = {
     "budget key": (("minutes", "hours"), "'budget.hours'"),
     "own test": (("seed = 5", "seed = 1"), "evaluate.seed 1 is evaluator.seed"),
     "weights": (("seed = 5", 'seed = 5\nweights = ["worst"]'), "'final' or 'best'"),
+    "values": (("seed = 5", "seed = 5\nvalues = 1"), "values must be true or false"),
+    "no final": (
+        ("seed = 5", 'seed = 5\nvalues = true\nweights = ["best"]'),
+        "evaluate.values needs 'final'",
+    ),
     "flat": (("learner.batch_size", "batch_size"), "write SECTION.FIELD"),
     "name": (("variants.plain", 'variants."a b"'), "variant 'a b'"),
     "toml": (("[budget]", "[budget"), "is not TOML"),
@@ -235,6 +244,40 @@ def test_other_evaluations_are_made_without_training_again(bench: Bench) -> None
     (call,) = bench.calls()
     assert call[0] == "evaluate"
     assert call[call.index("--episodes") + 1] == "4"
+
+
+def test_values_are_compared_with_returns_for_the_final_weights_only(bench: Bench) -> None:
+    only = ("--only", "plain-2robots-seed0-*")
+    bench.write(GRID.replace("seed = 5", 'seed = 5\nweights = ["final"]'))
+    assert bench.run(*only) == 0
+    bench.calls()
+    bench.write(GRID.replace("seed = 5", "seed = 5\nvalues = true"))
+    (cell, *_) = bench.cells()
+    (cell.run / "checkpoints" / "best.safetensors").touch()
+    assert cell.state is not State.DONE, "values were not asked for before"
+    assert bench.run(*only) == 0
+    calls = bench.calls()
+    assert [("--values" in call, Path(call[1]).name) for call in calls] == [
+        (True, "step_000000100"),
+        (False, "best.safetensors"),
+    ]
+    assert cell.state is State.DONE
+
+
+def test_training_is_told_by_whole_hundreds() -> None:
+    def record(number: int) -> EpisodeRecord:
+        won = Outcome.SUCCESS if number % 4 == 0 else Outcome.TIMEOUT
+        summary = EpisodeSummary("a", 0, number, won, 9, float(number), 1, 0.1, 5, 2.0, 2)
+        return EpisodeRecord(float(number), 10 * number, summary)
+
+    told = hundreds([record(number) for number in range(250)], 0.1)
+    assert told == {
+        "successes": [25, 25],
+        "score": [49.5, 149.5],
+        "mean_q": [20.0, 20.0],
+        "learner_steps": [990, 1990],
+    }
+    assert hundreds([record(0)], 1.0)["successes"] == []
 
 
 def test_a_failed_cell_is_named_and_tried_again_and_the_others_go_on(

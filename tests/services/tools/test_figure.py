@@ -35,7 +35,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     state = RunState(config)
     with Recorder(folder, config) as recorder:
         for number in range(200):
-            episode = EpisodeSummary("a", 0, number, Outcome.SUCCESS, 99, 1.0, 1, 0.1, 5, 2.0)
+            episode = EpisodeSummary("a", 0, number, Outcome.SUCCESS, 99, 1.0, 1, 0.1, 5, 2.0, 2)
             recorder.record_episode(episode, state, 0.5 * number)
         for k in range(3):
             judged = Evaluation("0", 1, k, 500 * k, 3, 100, 0.9, 0.1, 0.0,

@@ -18,6 +18,7 @@ from mrcdrl.services.tools.simulate.scaling import (
     flows,
     need,
     replay_cpu,
+    weights_bytes,
 )
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -37,9 +38,11 @@ def test_bytes_are_those_of_what_is_in_the_messages() -> None:
 
 
 def test_who_waits_for_the_learner_gives_no_more_than_it_draws() -> None:
-    one, many = (Pace.throttled(QUICK, actors, 4300.0, 100.0) for actors in (1, 1000))
-    assert one.transitions_per_s == many.transitions_per_s == 100 * 32 / 4
-    assert many.publications_per_s == 100 / QUICK.learner.publish_period
+    one, many = (Pace.throttled(QUICK, actors, 4300.0, 20.0) for actors in (1, 1000))
+    assert one.transitions_per_s == many.transitions_per_s == 20 * 128 / 1
+    assert one.publications_per_s == 20 / QUICK.learner.publish_period
+    spent = many.publications_per_s * weights_bytes(QUICK) * 1001  # with an evaluator
+    assert spent == pytest.approx(QUICK.learner.publish_bytes_per_s)
     fast = Pace.throttled(QUICK, 1, 4300.0, 10_000.0)
     assert fast.publications_per_s == 1 / QUICK.learner.publish_interval_s
     assert Pace.throttled(QUICK, 1, 10.0, 100.0).transitions_per_s == 10
@@ -60,7 +63,7 @@ def test_flows_of_transitions_rise_with_them_and_others_with_actors() -> None:
     ("pace", "first"),
     [
         (Pace(10, 1000.0, 1.0), "nothing"),
-        (Pace(10, 50_000.0, 1.0), "replay's process"),
+        (Pace(10, 100_000.0, 1.0), "replay's process"),
         (Pace(1000, 1000.0, 1.0), "the router's link"),
         (Pace(8000, 1000.0, 0.0), "the router's process"),
     ],

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from mrcdrl.common.config import load_config
-from mrcdrl.common.errors import ConfigError, UnreachableError
+from mrcdrl.common.errors import ConfigError, UnreachableError, WireError
+from mrcdrl.common.messages.trajectory import Weights
+from mrcdrl.common.messages.wire import encode
 from mrcdrl.services.replay.table import Table
-from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks
+from mrcdrl.services.tools.simulate.actors import EPISODE_FRAMES, episode_chunks, published_s
 from mrcdrl.services.tools.simulate.load import Load, Totals, Usage, bottleneck, busy_cores, latency
-from mrcdrl.services.tools.simulate.main import _allow_open_files, main
+from mrcdrl.services.tools.simulate.main import _check_open_files, main
 
 
 @pytest.mark.parametrize(
@@ -63,6 +65,15 @@ LIMITS = {
 }
 
 
+def test_weights_that_are_late_are_a_limit_and_the_simulation_tells_its_own_share() -> None:
+    usage = {"replay-0": using(0.9), "actors-0": using(0.8), "simulate": using(0.1)}
+    ours = frozenset({"actors-0", "simulate"})
+    said = bottleneck(Load(1000, 1000, 0.0, 2.0, 2, 1.98, usage, 0.4, ours))
+    assert said.startswith("weights: 60% of the publications were overtaken by newer ones; ")
+    assert said.endswith("all others 0.18; the simulation itself took 0.90")
+    assert bottleneck(Load(1000, 1000, 0.0, 2.0, 2, 1.98, usage, 0.99, ours)).startswith("none")
+
+
 @pytest.mark.parametrize(("load", "said"), LIMITS.values(), ids=LIMITS)
 def test_the_bottleneck_is_named(load: Load, said: str) -> None:
     assert said in bottleneck(load)
@@ -85,6 +96,13 @@ def test_what_a_process_used_is_read() -> None:
 def test_latency_in_milliseconds() -> None:
     assert latency(np.linspace(0, 1, 101)) == {"p50": 500.0, "p99": 990.0, "max": 1000.0}
     assert latency(np.empty(0)) == {"p50": None, "p99": None, "max": None}
+
+
+def test_weights_say_when_a_simulated_learner_published_them() -> None:
+    message = encode(Weights.of(2**62, 3, 12_345_678_901, bytes(1000)))
+    assert published_s(message) == pytest.approx(12.345678901)
+    with pytest.raises(WireError):
+        published_s(b"noise")
 
 
 # -- refusals ----------------------------------------------------------------------------
@@ -116,6 +134,11 @@ def test_bad_input_is_refused(
     assert said in line
 
 
+def test_too_few_places_are_reported_before_anything_starts() -> None:
+    with pytest.raises(ConfigError, match=r"for 45 actors: give --transport.max_peers 56 or more"):
+        main(["--actors", "45", "--transport.max_peers", "50"])
+
+
 def test_a_run_that_is_not_up_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UnreachableError, match=r"no run 'simulate-1'.*give --connect"):
         main(["simulate-1", "--run-dir", str(tmp_path)])
@@ -127,9 +150,9 @@ def test_too_few_open_files_are_reported_before_anything_starts(
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, 4096))
     asked: list[tuple[int, int]] = []
     monkeypatch.setattr(resource, "setrlimit", lambda _, limits: asked.append(limits))
-    _allow_open_files(100)
+    _check_open_files(100)
     assert asked == []
-    _allow_open_files(500)
-    assert asked == [(2200, 4096)]
-    with pytest.raises(ConfigError, match="2000 actors need 8200 open files"):
-        _allow_open_files(2000)
+    _check_open_files(500)
+    assert asked == [(1700, 4096)]
+    with pytest.raises(ConfigError, match="2000 actors need 6200 open files"):
+        _check_open_files(2000)

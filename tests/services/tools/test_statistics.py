@@ -19,6 +19,9 @@ from mrcdrl.services.tools.reproduce.statistics import (
     permutation_test,
     probability_of_improvement,
     verdict,
+    verdict_of_best,
+    verdict_of_equality,
+    verdict_of_level,
 )
 
 GOOD = (94.2, 96.1, 91.7, 97.0, 95.5)
@@ -105,6 +108,57 @@ def test_a_verdict_follows_the_interval_and_the_test(
     low: float, estimate: float, high: float, p: float, expected: Verdict
 ) -> None:
     assert verdict(comparison(low, estimate, high), p, 6.19) is expected
+
+
+def test_without_a_number_of_the_papers_better_is_reproduced() -> None:
+    assert verdict(comparison(4.0, 5.0, 6.0), 0.01, None) is Verdict.REPRODUCED
+
+
+def test_few_seeds_are_inconclusive() -> None:
+    few = Comparison(Interval(6.0, 2.0, 9.0, 4), Interval(1.0, 1.0, 1.0, 4), 0.03)
+    assert verdict(few, 0.03, 6.19) is Verdict.INCONCLUSIVE
+    assert verdict_of_equality([(few, 0.03)]) is Verdict.INCONCLUSIVE
+    assert verdict_of_best([(few, 0.03)]) is Verdict.INCONCLUSIVE
+    assert verdict_of_level(few.difference, 0.0) is Verdict.INCONCLUSIVE
+
+
+BETTER = (comparison(5.0, 8.0, 12.0), 0.01)
+WORSE = (comparison(-12.0, -8.0, -5.0), 0.01)
+EVEN = (comparison(-2.0, 0.5, 2.0), 0.01)
+WIDE = (comparison(-5.0, 3.0, 12.0), 0.4)
+NONE = (comparison(math.nan, math.nan, math.nan), math.nan)
+
+
+@pytest.mark.parametrize(
+    ("judged", "equality", "best"),
+    [
+        ([EVEN, EVEN], Verdict.REPRODUCED, Verdict.EQUAL),
+        ([EVEN, BETTER], Verdict.CONTRADICTED, Verdict.DIRECTION),
+        ([BETTER, BETTER], Verdict.CONTRADICTED, Verdict.REPRODUCED),
+        ([BETTER, WORSE], Verdict.CONTRADICTED, Verdict.CONTRADICTED),
+        ([BETTER, WIDE], Verdict.CONTRADICTED, Verdict.INCONCLUSIVE),
+        ([EVEN, WIDE], Verdict.INCONCLUSIVE, Verdict.INCONCLUSIVE),
+        ([EVEN, NONE], Verdict.NOT_TESTED, Verdict.NOT_TESTED),
+    ],
+)
+def test_verdicts_on_several_comparisons(
+    judged: list[tuple[Comparison, float]], equality: Verdict, best: Verdict
+) -> None:
+    assert verdict_of_equality(judged) is equality
+    assert verdict_of_best(judged) is best
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (89.4, 97.0, Verdict.REPRODUCED),
+        (80.0, 95.0, Verdict.INCONCLUSIVE),
+        (80.0, 89.0, Verdict.CONTRADICTED),
+        (math.nan, math.nan, Verdict.NOT_TESTED),
+    ],
+)
+def test_a_level_is_reached_within_three_points(low: float, high: float, expected: Verdict) -> None:
+    assert verdict_of_level(Interval((low + high) / 2, low, high, 5), 92.33) is expected
 
 
 def test_two_kinds_are_compared_seed_by_seed() -> None:

@@ -54,6 +54,7 @@ def test_the_result_comes_first_then_what_to_do_and_then_the_files(run: Path) ->
         "took      1.5 minutes, 0 learner steps",
         "next      mrcdrl evaluate four",
         "          mrcdrl render four --out four.mp4",
+        "          mrcdrl web four",
         "          mrcdrl train --resume four",
         f"files     {run}: summary.json, checkpoints/best.safetensors",
     ]

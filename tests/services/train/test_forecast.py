@@ -23,7 +23,7 @@ def test_it_lists_what_differs_from_the_preset_and_writes_nothing(
     assert re.search(r"^run +.*runs/four$", said, re.M)
     assert "quick, with 2 settings changed" in said
     assert "arena.num_robots = 4 (there: 2)" in said
-    assert "learner.batch_size = 64 (there: 32)" in said
+    assert "learner.batch_size = 64 (there: 128)" in said
     assert "25 learner steps a second" in said
     assert "95.0% success, or 90 minutes" in said
     assert list(tmp_path.iterdir()) == []
@@ -42,7 +42,7 @@ def test_replays_log_grows_by_what_is_collected_until_the_table_is_full(
 def test_it_says_how_long_a_number_of_steps_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = told(capsys, tmp_path, "--config", "quick", "--learner-steps", "41_896")
+    said = told(capsys, tmp_path, "--learner.batch_size", "32", "--learner-steps", "41_896")
     assert "estimate: 14 minutes to 41896" in said  # as the run did from which it is estimated
 
 

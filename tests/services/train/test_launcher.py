@@ -8,6 +8,7 @@ import pytest
 
 from mrcdrl.common.config import Config, TransportConfig, load_config
 from mrcdrl.common.errors import ConfigError, EndpointError
+from mrcdrl.common.runtime.files import FILM, MOVING_PICTURE
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.transport import Session, free_endpoint
@@ -16,7 +17,6 @@ from mrcdrl.services.replay.serving import Serving
 from mrcdrl.services.train import launcher
 from mrcdrl.services.train.fleet import Fleet
 from mrcdrl.services.train.launcher import (
-    FILM,
     check_possible,
     start_replay,
     start_workers,
@@ -104,6 +104,7 @@ REPORTS = """
 import pathlib, sys, time
 run = pathlib.Path(sys.argv[-1])
 (run / "training.png").write_bytes(b"whole")
+(run / "evaluation.gif").write_bytes(b"whole or not")
 if (run / "films").exists():
     (run / "evaluation.mp4").write_bytes(b"cut off")
 (run / "ready").touch()
@@ -125,6 +126,7 @@ def test_a_signal_skips_the_plots_and_leaves_whole_files_only(
     ]
     assert (tmp_path / "training.png").exists()
     assert (tmp_path / FILM).exists() == (not films)
+    assert (tmp_path / MOVING_PICTURE).exists() == films  # nobody knows whether the last is whole
 
 
 def test_the_progress_of_plots_is_logged_as_it_comes(

@@ -27,7 +27,7 @@ def ended(folder: Path, limits: dict[str, str]) -> Path:
         with Recorder(run.path, config) as recorder:
             for number in range(200):
                 outcome = Outcome.SUCCESS if number < 100 else Outcome.TIMEOUT
-                episode = EpisodeSummary("actor-0", 1, number, outcome, 9, 1.0, 0, 0.1, 0, 1.0)
+                episode = EpisodeSummary("actor-0", 1, number, outcome, 9, 1.0, 0, 0.1, 0, 1.0, 2)
                 state.observe_episode(episode)
                 recorder.record_episode(episode, state, 5.0)
             judged = Evaluation(
