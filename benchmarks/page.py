@@ -8,7 +8,8 @@ nobody, twenty do. A viewer takes the state and an actor's frames, as a page doe
 them. People watch from other machines, so viewers take only cores that the run leaves, where the
 command leads its session (`setsid`). Of each phase: learner steps a second as recorded, frames a
 second that a viewer got, and the share of a core that the server took. With --browser also how long
-a page takes to load, to show its first picture and curves, in Chromium. Prints one line of JSON per
+a page takes to load, to show its first picture and curves, in Chromium: the first one that it
+opens, and those opened from the list of runs afterwards, as people do. Prints one line of JSON per
 phase, then medians on stderr.
 """
 
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from http.client import HTTPConnection
 from pathlib import Path
@@ -35,6 +37,7 @@ from tests.system.system_processes import Command, end_all, processes_of, run_na
 PHASES = {"nobody": 0, "one": 1, "nobody again": 0, "twenty": 20}
 _VIEWERS_NICE = 19
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+_FROM_THE_LIST = 3  # openings
 _SETTLE_S = 12.0  # longer than a run is followed after its last viewer
 # Notes in the page when it has loaded, and when curves and a picture are first there.
 _NOTE_TIMES = """
@@ -100,7 +103,8 @@ def main() -> None:
         eventually(lambda: learner_steps(run) > 0, "the first learner steps", 900.0)
         (server,) = processes_of(str(run), " web ")
         if arguments.browser:
-            emit({"bench": "page", "browser": in_browser(port, name)})
+            for opened, times in in_browser(port, name):
+                emit({"bench": "page", "opened": opened, "browser": times})
         yield_cores(_VIEWERS_NICE)  # as if viewers were on other machines
         for number in range(arguments.rounds):
             for phase, viewers in PHASES.items():
@@ -133,7 +137,7 @@ def measured(run: Path, port: int, server: int, num_viewers: int, seconds: float
     }
 
 
-def in_browser(port: int, name: str) -> dict[str, float]:
+def in_browser(port: int, name: str) -> Iterator[tuple[str, dict[str, float]]]:
     """Seconds from asking for the page until it is loaded, has curves, and a picture."""
     from playwright.sync_api import sync_playwright
 
@@ -142,12 +146,21 @@ def in_browser(port: int, name: str) -> dict[str, float]:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         page = browser.new_page()
         page.add_init_script(_NOTE_TIMES)
-        started = time.time()
-        page.goto(f"http://127.0.0.1:{port}/run?name={name}")
-        page.wait_for_function("() => Object.keys(noted).length === 3")
-        noted: dict[str, float] = page.evaluate("noted")
+
+        def times(ask: Callable[[], object]) -> dict[str, float]:
+            started = time.time()
+            ask()
+            page.wait_for_function("() => Object.keys(noted).length === 3")
+            noted: dict[str, float] = page.evaluate("noted")
+            return {f"{what}_s": at_s - started for what, at_s in sorted(noted.items())}
+
+        yield "first", times(lambda: page.goto(f"http://127.0.0.1:{port}/run?name={name}"))
+        for _ in range(_FROM_THE_LIST):
+            page.goto(f"http://127.0.0.1:{port}/")
+            page.wait_for_selector(f"a[href*={name}]")
+            time.sleep(_SETTLE_S)
+            yield "from the list", times(page.locator(f"a[href*={name}]").first.click)
         browser.close()
-    return {f"{what}_s": at_s - started for what, at_s in sorted(noted.items())}
 
 
 def port_of(text: str) -> int | None:

@@ -84,7 +84,8 @@ class Reader:
             for process in reversed(started):
                 process.send_signal(signal.SIGTERM)
             codes = [process.wait(PATIENCE_S) for process in started]
-        assert codes == [0] * len(started)
+        # One that was still being imported ends by the signal itself.
+        assert set(codes) <= {0, -signal.SIGTERM}
         return outputs
 
     def _start(self, text: str) -> "subprocess.Popen[bytes]":
