@@ -33,7 +33,8 @@ def main(argv: Sequence[str]) -> int:
         claim_shard(session, keys, shard, stop)
         config_requests = session.server(keys.config)
         lease_requests = session.server(keys.leases) if shard == 0 else None
-        inserts, samples = session.server(keys.insert(shard)), session.server(keys.sample(shard))
+        inserts = session.server(keys.insert(shard), capacity=serving.transport.max_peers)
+        samples = session.server(keys.sample(shard))
         priorities = session.server(keys.priorities(shard))
         stats = session.publisher(keys.stats("replay", serving.worker))
         reporter = StatsReporter(stats, "replay", serving.worker)

@@ -1,5 +1,7 @@
 """The shell around the table: threads that insert, sample and set priorities, under one lock.
 
+Inserts are stored in the order in which their actors first asked (`turns.py`).
+
 Invariants: a chunk is acknowledged only after it is in the log and the table; every request is
 answered within `hold_s`: with the data, refused with the reason, or throttled, which tells the
 peer to ask again.
@@ -31,28 +33,18 @@ from mrcdrl.services.replay.log import SegmentLog
 from mrcdrl.services.replay.sequence import Arrival, SequenceBook
 from mrcdrl.services.replay.snapshot import Snapshot, SnapshotWriter, read_snapshot
 from mrcdrl.services.replay.table import Table
+from mrcdrl.services.replay.turns import Request, Turns, Waiting
 
 _LOG = logging.getLogger("replay")
 _TAKE_S = 0.2  # how soon a thread notices a stop
 _GROUP = 16  # insert requests stored under one lock at most
+_TAKEN = 256  # insert requests put in the line at once at most
+_HELD = 4  # largest messages that may wait in the line
+_TOO_FEW_SAMPLES = "the learner has not sampled enough of what is there yet"
 _COUNTS = (
     *("chunks", "duplicates", "gaps", "refused", "log_errors"),
     *("priority_updates", "priorities_ignored"),
 )
-
-
-class _Request(Protocol):
-    """What the service needs from a transport's request."""
-
-    @property
-    def payload(self) -> Part: ...
-    @property
-    def arrived_s(self) -> float: ...
-
-    def room(self, size: int) -> memoryview | None: ...
-    def reply(self, payload: Part | Sequence[Part]) -> None: ...
-    def refuse(self, reason: str) -> None: ...
-    def throttle(self, reason: str) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +60,7 @@ class _Accepted:
 class _Server(Protocol):
     refused: int  # requests too large to take
 
-    def take(self, timeout_s: float) -> _Request | None: ...
+    def take(self, timeout_s: float) -> Request | None: ...
 
 
 class ReplayService:
@@ -95,8 +87,10 @@ class ReplayService:
         )
         self._admission = make_admission(config, table, limiter)
         self._book = SequenceBook()
+        self._turns = Turns(config.replay.hold_s)
+        self._most_held_bytes = _HELD * config.transport.max_message_bytes
         self._accepted: list[_Accepted] = []  # neither logged nor stored yet
-        self._owed: list[tuple[_Request, InsertReply]] = []  # replies due once they are stored
+        self._owed: list[tuple[Waiting, InsertReply]] = []  # replies due once they are stored
         self._earlier = {"inserts": 0, "samples": 0}  # not counted by the limiter
         self._changed = threading.Condition()
         self._log_fails = False
@@ -201,54 +195,116 @@ class ReplayService:
                 **self._throttled,
             )
 
-    def _serve(self, server: _Server, answer: Callable[[_Request], None]) -> None:
+    def _serve(self, server: _Server, answer: Callable[[Request], None]) -> None:
         while not self._stopping.is_set():
             request = server.take(_TAKE_S)
             if request is not None:
                 self._answer(request, answer)
 
     def _serve_inserts(self, server: _Server) -> None:
-        """Write and store the requests that are already waiting together.
-
-        A write costs one wait for the interpreter lock, storing one wait for a whole sample.
-        """
+        """Take in what has arrived, then store what the rate limiter admits, in turn."""
         while not self._stopping.is_set():
-            for count in range(_GROUP):
-                request = server.take(0.0 if count else _TAKE_S)
-                if request is None:
-                    break
-                self._answer(request, self._insert)
-            self._commit()
+            self._take_in(server)
+            held = self._store_in_turn()
+            if held is not None:
+                self._await_samples(held)
+                now_s = time.monotonic()
+                for waiting in self._turns.overdue(now_s):
+                    self._turns.ask_again(waiting, _TOO_FEW_SAMPLES, now_s)
+        for waiting in self._turns.all():
+            self._turns.ask_again(waiting, "replay is stopping", time.monotonic())
 
-    def _answer(self, request: _Request, answer: Callable[[_Request], None]) -> None:
+    def _take_in(self, server: _Server) -> None:
+        """Put the requests that have arrived in the line; wait for one if it is empty."""
+        timeout_s = 0.0 if self._turns else _TAKE_S
+        for _ in range(_TAKEN):
+            if self._turns.held_bytes > self._most_held_bytes:
+                return
+            request = server.take(timeout_s)
+            if request is None:
+                return
+            self._answer(request, self._join)
+            timeout_s = 0.0
+
+    def _join(self, request: Request) -> None:
+        messages = split_set(request.payload)
+        self._turns.join(Waiting(request, messages, decode(Chunk, messages[0])))
+
+    def _store_in_turn(self) -> Waiting | None:
+        """Store and acknowledge some requests; return the one that the limiter holds, if any.
+
+        A write to the log costs one wait for the interpreter lock, storing one wait for a whole
+        sample.
+        """
+        for _ in range(_GROUP):
+            waiting = self._turns.first()
+            if waiting is None:
+                break
+            try:
+                admitted = self._insert(waiting)
+            except WireError as error:
+                self._turns.leave(waiting)
+                self._refuse(waiting.request, error)
+                continue
+            if not admitted:
+                why_not = self._commit()
+                if why_not:
+                    self._turns.ask_again(waiting, why_not, time.monotonic())
+                return None if why_not else waiting
+            self._turns.leave(waiting)
+        self._commit()
+        return None
+
+    def _answer(self, request: Request, answer: Callable[[Request], None]) -> None:
         try:
             answer(request)
         except WireError as error:
-            with self._changed:
-                self._counts["refused"] += 1
-            request.refuse(str(error))
+            self._refuse(request, error)
 
-    def _insert(self, request: _Request) -> None:
-        """Accept the chunks of a request; `_commit` answers it unless it is throttled here.
+    def _refuse(self, request: Request, error: WireError) -> None:
+        with self._changed:
+            self._counts["refused"] += 1
+        request.refuse(str(error))
 
-        Only one thread inserts, so what it found stays true while it does not hold the lock.
+    def _insert(self, waiting: Waiting) -> bool:
+        """Accept the chunks that the rate limiter admits; whether these are all of them.
+
+        `_commit` stores and acknowledges them. Only one thread inserts, so what it found stays
+        true while it does not hold the lock, and sampling only allows more.
         """
-        messages = split_set(request.payload)
-        chunks = [self._checked(message) for message in messages]
-        for message, chunk in zip(messages, chunks, strict=True):
+        if not waiting.chunks:
+            others = (decode(Chunk, message) for message in waiting.messages[1:])
+            waiting.chunks = [self._checked(chunk) for chunk in (waiting.first, *others)]
+        for index in range(waiting.taken, len(waiting.chunks)):
+            chunk = waiting.chunks[index]
             arrival = self._classify(chunk)
             if arrival is Arrival.REPEATED:
                 self._counts["duplicates"] += 1
-                continue
-            why_not = self._why_not_admitted(request, chunk)
-            if why_not:
-                request.throttle(why_not)
-                return
-            before = self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
-            self._accepted.append(_Accepted(message, chunk, arrival, before))
+            elif not self._limiter.can_insert(self._num_accepted + len(chunk)):
+                return False
+            else:
+                self._throttled["insert_held"] = False
+                before = self._book.record(chunk.actor, chunk.incarnation, chunk.sequence)
+                message = waiting.messages[index]
+                self._accepted.append(_Accepted(message, chunk, arrival, before))
+            waiting.taken = index + 1
         total = self._table.next_key + self._num_accepted
         reply = InsertReply(chunk.sequence, arrival is Arrival.REPEATED, total)
-        self._owed.append((request, reply))
+        self._owed.append((waiting, reply))
+        return True
+
+    def _await_samples(self, held: Waiting) -> None:
+        """Wait until the limiter admits the request's next chunk, or one must be answered."""
+        length = len(held.chunks[held.taken])
+        due_s = self._turns.next_answer_s()
+        left_s = _TAKE_S if due_s is None else min(due_s - time.monotonic(), _TAKE_S)
+        with self._changed:
+            self._throttled["insert_held"] = True
+            self._changed.wait_for(
+                lambda: self._stopping.is_set() or self._limiter.can_insert(length),
+                max(left_s, 0.0),
+            )
+            self._throttled["insert_held"] = not self._limiter.can_insert(length)
 
     def _commit(self) -> str:
         """Log and store the accepted chunks, and answer; return why all are throttled, or ""."""
@@ -258,8 +314,8 @@ class ReplayService:
         if why_not:
             for each in reversed(accepted):
                 self._book.take_back(each.chunk.actor, each.chunk.incarnation, each.before)
-            for request, _ in owed:
-                request.throttle(why_not)
+            for waiting, _ in owed:
+                self._turns.ask_again(waiting, why_not, time.monotonic())
             return why_not
         if accepted:
             with self._changed:
@@ -267,8 +323,8 @@ class ReplayService:
                     self._store(each.chunk, each.arrival)
                 self._changed.notify_all()
             self._forget()
-        for request, reply in owed:
-            request.reply(encode(reply))
+        for waiting, reply in owed:
+            waiting.request.reply(encode(reply))
         return ""
 
     def _append(self, accepted: Sequence[_Accepted]) -> str:
@@ -288,8 +344,7 @@ class ReplayService:
         self._log_fails = False
         return ""
 
-    def _checked(self, message: Part) -> Chunk:
-        chunk = decode(Chunk, message)
+    def _checked(self, chunk: Chunk) -> Chunk:
         self._table.check(chunk)
         if len(chunk) > self._limiter.largest_insert:
             raise WireError(
@@ -297,19 +352,6 @@ class ReplayService:
                 f"{self._limiter.largest_insert}: the rate limiter might never admit them"
             )
         return chunk
-
-    def _why_not_admitted(self, request: _Request, chunk: Chunk) -> str:
-        """Why the rate limiter does not admit the chunk yet; "" if it does."""
-        if self._limiter.can_insert(self._num_accepted + len(chunk)):  # sampling only allows more
-            self._throttled["insert_held"] = False
-            return ""
-        why_not = self._commit()
-        if why_not:
-            return why_not
-        with self._changed:
-            if self._wait("insert_held", request, lambda: self._limiter.can_insert(len(chunk))):
-                return ""
-        return "the learner has not sampled enough of what is there yet"
 
     @property
     def _num_accepted(self) -> int:
@@ -335,7 +377,7 @@ class ReplayService:
         except OSError as error:
             _LOG.warning("cannot delete an old segment of the log: %s", reason(error))
 
-    def _sample(self, request: _Request) -> None:
+    def _sample(self, request: Request) -> None:
         wanted = decode(SampleRequest, request.payload)
         size = wanted.batch_size
         if not 1 <= size <= self._limiter.largest_sample:
@@ -350,7 +392,7 @@ class ReplayService:
             self._changed.notify_all()
         request.reply(encode_parts(samples))
 
-    def _prioritize(self, request: _Request) -> None:
+    def _prioritize(self, request: Request) -> None:
         message = decode(Priorities, request.payload)
         with self._changed:
             updated = self._table.update_priorities(message.keys, message.priorities)
@@ -359,7 +401,7 @@ class ReplayService:
             self._counts["priorities_ignored"] += ignored
         request.reply(encode(PrioritiesReply(updated, ignored)))
 
-    def _wait(self, flag: str, request: _Request, ready: Callable[[], bool]) -> bool:
+    def _wait(self, flag: str, request: Request, ready: Callable[[], bool]) -> bool:
         """Release the lock and wait until ready; return False if that took too long."""
         if ready():
             self._throttled[flag] = False

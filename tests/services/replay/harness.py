@@ -112,10 +112,10 @@ def offer(service: ReplayService, *chunks: Chunk, together: bool = False) -> lis
     """Insert chunks, one by one or in one commit; each request's answer."""
     requests = [FakeRequest(encode(chunk), arrived_s=0.0) for chunk in chunks]
     for request in requests:
-        service._insert(request)
+        service._join(request)
         if not together:
-            service._commit()
-    service._commit()
+            service._store_in_turn()
+    service._store_in_turn()
     assert [request.answers.qsize() for request in requests] == [1] * len(requests)
     return [request.answer() for request in requests]
 
