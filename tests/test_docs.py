@@ -41,6 +41,7 @@ from mrcdrl.common.messages.trajectory import (
     Samples,
     Stats,
     Weights,
+    WeightsNotice,
 )
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.model.q_network import QNetwork
@@ -81,6 +82,7 @@ MESSAGES = (
     LeaseRequest,
     LeaseReply,
     Weights,
+    WeightsNotice,
     EpisodeSummary,
     Evaluation,
     Stats,
@@ -218,7 +220,7 @@ def test_key_is_documented(key: str) -> None:
 def number(value: float) -> str:
     """A limit as docs/wire.md writes it."""
     sign, size = "−" if value < 0 else "", abs(value)
-    return sign + {2**53: "2^53", 2**63: "2^63"}.get(int(size), f"{size:g}")
+    return sign + {2**30: "2^30", 2**53: "2^53", 2**63: "2^63"}.get(int(size), f"{size:g}")
 
 
 def test_ranges_that_a_receiver_checks_are_documented() -> None:

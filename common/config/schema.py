@@ -554,8 +554,8 @@ class LearnerConfig(Section):
     """Least time between publications: a fast learner skips some, which leaves their readers time
     to adopt them. Not with run.turn_size. (ours)"""
     publish_bytes_per_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3e8
-    """Bytes of weights a second to all actors and evaluators together: the more of them there are,
-    the less often weights are published. 0: no limit. Not with run.turn_size. (ours)"""
+    """Bytes of weights a second that other hosts may take of the learner's link: the more of them
+    ask, the less often there are new ones. 0: no limit. Not with run.turn_size. (ours)"""
     publish_precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Precision of published weights: half precision halves their bytes, and readers cast up. The
     best weights are kept as evaluated. (ours)"""

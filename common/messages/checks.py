@@ -5,6 +5,7 @@ a process of ours sends is refused. What has passed needs no guard behind `decod
 """
 
 import math
+import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -32,6 +33,7 @@ from mrcdrl.common.messages.trajectory import (
     Samples,
     Stats,
     Weights,
+    WeightsNotice,
 )
 from mrcdrl.common.runtime.files import sha256
 from mrcdrl.common.runtime.names import MAX_NAME, is_name, printable
@@ -46,6 +48,8 @@ MAX_TEXT = 256  # characters
 _MOST = 2**53  # the largest count that a float64 holds exactly
 _LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 _RATES_SUM = 1e-3  # rates rounded by a sender may miss 1 by this
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_MAX_ADDRESS = 128  # characters
 _COUNT: Range = (0, _MOST)
 _NUMBER: Range = (-_MOST, _MOST)
 _FRACTION: Range = (0, 1)
@@ -67,6 +71,12 @@ RANGES: dict[type, dict[str, Range]] = {
     Samples: {"table_size": (1, _MOST)},
     PrioritiesReply: {"updated": _COUNT, "ignored": _COUNT},
     Weights: {"epoch": _TIME_NS, "version": _COUNT, "learner_step": _COUNT},
+    WeightsNotice: {
+        "epoch": _TIME_NS,
+        "version": _COUNT,
+        "learner_step": _COUNT,
+        "num_bytes": (1, 2**30),
+    },
     EpisodeSummary: {
         "arena": _COUNT,
         "episode": _COUNT,
@@ -213,6 +223,14 @@ def _check_weights(weights: Weights) -> str | None:
     return None
 
 
+def _check_weights_notice(notice: WeightsNotice) -> str | None:
+    if not _DIGEST.fullmatch(notice.digest):
+        return "digest is not a SHA-256 in hexadecimal digits"
+    if len(notice.address) > _MAX_ADDRESS:
+        return f"an address of {len(notice.address)} characters"
+    return None
+
+
 def _check_evaluation(evaluation: Evaluation) -> str | None:
     rates = evaluation.success_rate + evaluation.collision_rate + evaluation.timeout_rate
     if abs(rates - 1) > _RATES_SUM:
@@ -303,6 +321,7 @@ _CHECKS: dict[type, Callable[[Any], str | None]] = {
     LeaseRequest: _check_lease_request,
     LeaseReply: _check_lease_reply,
     Weights: _check_weights,
+    WeightsNotice: _check_weights_notice,
     Evaluation: _check_evaluation,
     Stats: _check_stats,
     ArenaFrame: _check_arena_frame,

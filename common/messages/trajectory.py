@@ -217,6 +217,22 @@ class Weights:
 
 
 @dataclass(frozen=True, slots=True)
+class WeightsNotice:
+    """Says that there are new weights, and where to get them without asking the learner."""
+
+    epoch: int  # these three as in Weights
+    version: int
+    learner_step: int
+    digest: str  # SHA-256 of the payload, hexadecimal
+    num_bytes: int  # length of the payload
+    address: str  # of the payload in sealed memory of the learner's host; "" if it shares none
+
+    @property
+    def order(self) -> tuple[int, int]:
+        return (self.epoch, self.version)
+
+
+@dataclass(frozen=True, slots=True)
 class EpisodeSummary:
     """One finished training episode."""
 

@@ -36,13 +36,13 @@ from mrcdrl.common.messages.trajectory import (
     Samples,
     Stats,
     Weights,
+    WeightsNotice,
 )
 from mrcdrl.common.runtime.names import printable
 
 M = TypeVar("M")
 _MAX_NDIM = 8
 _LARGE_BYTES = 8192  # arrays of this size or more follow the map
-_HEAD = 256  # bytes of encoded weights, in which all but the payload begins
 
 _SCHEMAS: dict[type, str] = {
     Chunk: "chunk/1",
@@ -54,6 +54,7 @@ _SCHEMAS: dict[type, str] = {
     LeaseRequest: "lease_request/1",
     LeaseReply: "lease_reply/1",
     Weights: "weights/2",
+    WeightsNotice: "weights_notice/1",
     EpisodeSummary: "episode/2",
     Evaluation: "evaluation/1",
     Stats: "stats/1",
@@ -83,16 +84,6 @@ def encode_parts(message: Any) -> list[Part]:
                 place += padded(little.nbytes)
         table[field.name] = value
     return join_map(msgpack.packb(table), large)
-
-
-def learner_step_of(weights: bytes) -> int:
-    """The learner step of encoded weights, whose payload is left alone; raises WireError."""
-    try:
-        unpacker = msgpack.Unpacker()
-        unpacker.feed(weights[:_HEAD].partition(b"learner_step")[2])
-        return int(unpacker.unpack())
-    except (ValueError, msgpack.exceptions.UnpackException) as error:
-        raise WireError("these are no weights") from error
 
 
 def decode(cls: type[M], data: Part) -> M:

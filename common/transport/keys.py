@@ -6,6 +6,7 @@ mrcdrl/<run>/replay/<shard>/priorities query: Priorities -> PrioritiesReply
 mrcdrl/<run>/config                    query: nothing -> the configuration as TOML
 mrcdrl/<run>/leases                    query: LeaseRequest -> LeaseReply
 mrcdrl/<run>/weights                   publication and query: Weights
+mrcdrl/<run>/weights/notice            publication and query: WeightsNotice
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
 mrcdrl/<run>/stats/<role>/<worker>     publication: Stats
@@ -48,6 +49,10 @@ class Keys:
     @property
     def weights(self) -> str:
         return f"mrcdrl/{self.run}/weights"
+
+    @property
+    def weights_notice(self) -> str:
+        return f"mrcdrl/{self.run}/weights/notice"
 
     def evaluation(self, worker: str) -> str:
         return f"mrcdrl/{self.run}/evaluation/{worker}"

@@ -6,13 +6,14 @@ what happens when it is full.
 
 import queue
 import threading
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
 
 import zenoh
 
 from mrcdrl.common.errors import TransportError
 
+T = TypeVar("T")
 _WAITING_BYTES = 1 << 24  # of publications that wait for their reader
 
 
@@ -38,10 +39,7 @@ class Publisher:
 
 
 class WatchedPublisher(Publisher):
-    """A publisher that knows whether anybody listens, at the cost of reading a flag.
-
-    What the link has no room for is dropped.
-    """
+    """A publisher that knows whether anybody listens, at the cost of reading a flag."""
 
     watched = False
     listener: Any = None  # Zenoh's, which tells `observe` while it is held
@@ -51,13 +49,20 @@ class WatchedPublisher(Publisher):
         self.watched = bool(status.matching)
 
 
-class LatestSubscriber:
+def as_it_is(payload: bytes) -> bytes:
+    """The payload itself."""
+    return payload
+
+
+class LatestSubscriber(Generic[T]):
     """The newest publication, for one reading thread."""
 
-    def __init__(self, max_message_bytes: int) -> None:
+    def __init__(self, max_message_bytes: int, opened: Callable[[bytes], T]) -> None:
+        """opened: what to keep of a payload; called by Zenoh's thread, so it must be quick."""
         self._max_bytes = max_message_bytes
+        self._opened = opened
         self._changed = threading.Condition()
-        self._newest: bytes | None = None
+        self._newest: T | None = None
         self.oversized = 0
 
     def offer(self, sample: Any) -> None:
@@ -65,12 +70,12 @@ class LatestSubscriber:
         if len(sample.payload) > self._max_bytes:
             self.oversized += 1
             return
-        payload = sample.payload.to_bytes()
+        newest = self._opened(sample.payload.to_bytes())
         with self._changed:
-            self._newest = payload
+            self._newest = newest
             self._changed.notify_all()
 
-    def take(self, timeout_s: float = 0.0) -> bytes | None:
+    def take(self, timeout_s: float = 0.0) -> T | None:
         """The newest, if not taken yet; None if none came within `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not None, timeout_s)

@@ -12,13 +12,14 @@ import logging
 import queue
 import re
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import zenoh
 
@@ -41,6 +42,7 @@ from mrcdrl.common.transport.publications import (
     Publisher,
     QueueSubscriber,
     WatchedPublisher,
+    as_it_is,
 )
 from mrcdrl.common.transport.queries import Client, Server
 from mrcdrl.common.transport.shared_memory import BufferPool
@@ -57,6 +59,7 @@ _ENCRYPTED = "tls/"
 _PORT_0 = re.compile(r"[^?#]*:0+(?![^?#])")
 _TCP = re.compile(r"tcp/\[?([^?#]*?)\]?:(\d+)(?![^?#])")
 _LOOPBACK = re.compile(r"[a-z]+/(127\.|\[::1\]|localhost:)")
+T = TypeVar("T")
 _CLIENT_SETTINGS: dict[str, Any] = {
     "mode": "client",
     "connect/timeout_ms": 0,  # one attempt: `random_pauses` says when to try again
@@ -173,7 +176,7 @@ class Session(Closing):
             pauses = random_pauses()
             while lost is self._session and not self._closed.wait(next(pauses)):
                 with contextlib.suppress(zenoh.ZError):
-                    self._move_to(zenoh.open(self._settings))
+                    self._move_to(self._heard(self._settings))
 
     def _move_to(self, fresh: zenoh.Session) -> None:
         """Declare everything on another session and close the present one; raises ZError."""
@@ -184,7 +187,11 @@ class Session(Closing):
                 for declaration in self._declarations:
                     declaration.on(fresh)
                 other, self._session = self._session, fresh
-            _settle(fresh, self._config.timeout_s)
+            try:
+                _settle(fresh, self._config.timeout_s)
+            except zenoh.ZError:
+                self._lost.put(fresh)
+                raise
         finally:
             with contextlib.suppress(zenoh.ZError):
                 other.close()  # type: ignore[no-untyped-call]
@@ -199,26 +206,46 @@ class Session(Closing):
         )
         return publisher
 
-    def watched_publisher(self, key: str) -> WatchedPublisher:
-        """Publisher whose `watched` says whether anybody has subscribed; a full link drops.
+    @property
+    def shares_memory(self) -> bool:
+        """Whether large messages may go through the memory of this host."""
+        return self._config.shared_memory and sys.platform == "linux"
 
-        Only for messages that may be lost, and that one batch of the link can hold (64 KiB).
+    def watched_publisher(self, key: str, priority: Priority | None = None) -> WatchedPublisher:
+        """Publisher whose `watched` says whether anybody has subscribed.
+
+        priority: `put` blocks when the link is full. None: the message is dropped then; only for
+        messages that may be lost, and that one batch of the link can hold (64 KiB).
         """
         publisher = WatchedPublisher()
         handler = zenoh.handlers.Callback(publisher.observe, indirect=False)
-        drop, last = zenoh.CongestionControl.DROP, zenoh.Priority.BACKGROUND
+        control, given = zenoh.CongestionControl.BLOCK, zenoh.Priority.BACKGROUND
+        if priority is None:
+            control = zenoh.CongestionControl.DROP
+        else:
+            given = priority.value
 
         def make(on: zenoh.Session) -> Any:
-            declared = on.declare_publisher(key, congestion_control=drop, priority=last)
+            declared = on.declare_publisher(key, congestion_control=control, priority=given)
             publisher.listener = declared.declare_matching_listener(handler)
             return declared
 
         self._declare(make, publisher.attach)
         return publisher
 
-    def latest_subscriber(self, key: str) -> LatestSubscriber:
-        """Subscriber that keeps the newest publication only: older ones are overwritten."""
-        latest = LatestSubscriber(self._config.max_message_bytes)
+    @overload
+    def latest_subscriber(self, key: str) -> LatestSubscriber[bytes]: ...
+    @overload
+    def latest_subscriber(self, key: str, opened: Callable[[bytes], T]) -> LatestSubscriber[T]: ...
+
+    def latest_subscriber(
+        self, key: str, opened: Callable[[bytes], Any] = as_it_is
+    ) -> LatestSubscriber[Any]:
+        """Subscriber that keeps the newest publication only: older ones are overwritten.
+
+        opened: what to keep of a payload; called by Zenoh's thread, so it must be quick.
+        """
+        latest = LatestSubscriber(self._config.max_message_bytes, opened)
         handler = zenoh.handlers.Callback(latest.offer, indirect=False)
         self._declare(lambda on: on.declare_subscriber(key, handler))
         return latest
@@ -333,7 +360,7 @@ class Session(Closing):
         told, pauses = False, random_pauses()
         while True:
             try:
-                return zenoh.open(settings)
+                return zenoh.open(settings) if self._listen else self._heard(settings)
             except zenoh.ZError as error:
                 if self._listen:
                     raise EndpointError(
@@ -347,6 +374,19 @@ class Session(Closing):
                     _LOG.warning("%s; trying again for %.0f s", self._refusal(), left_s)
                     told = True
                 time.sleep(min(next(pauses), left_s))
+
+    def _heard(self, settings: zenoh.Config) -> zenoh.Session:
+        """Open a client's session that the router answers; raises ZError.
+
+        In a storm of joins a router may drop one half-made, and never hear its session.
+        """
+        session = zenoh.open(settings)
+        try:
+            _settle(session, self._config.timeout_s)
+        except zenoh.ZError:
+            session.close()  # type: ignore[no-untyped-call]
+            raise
+        return session
 
     def _refusal(self) -> str:
         """Why this client is not let in, as far as that can be known from outside."""
@@ -384,8 +424,9 @@ def _settle(session: zenoh.Session, timeout_s: float) -> None:
 
     It handles the messages of a link in order, but those of two links in any.
     """
-    for _ in session.liveliness().get(_NOBODY, timeout=timeout_s):
-        pass
+    for reply in session.liveliness().get(_NOBODY, timeout=timeout_s):
+        if reply.ok is None:
+            raise zenoh.ZError("connected, but the router does not answer")
 
 
 def _files(max_peers: int) -> int:

@@ -2,7 +2,8 @@
 
 A client offers its peer a shared buffer, a sealed memfd (a "slot" on the wire), by an address
 `<boot> <process> <descriptor> <token>`. The peer opens it through /proc, reads a large request from
-it, or writes a large answer into it.
+it, or writes a large answer into it. `SealedMemory` is for what many processes read: a memfd that
+nobody can alter once it is filled.
 
 Invariants: a buffer has no name in any file system, so nothing is left when either end is killed;
 only a sealed memfd of ours that begins with the token is ever mapped, and it cannot shrink under
@@ -32,6 +33,7 @@ from mrcdrl.common.messages.framing import ALIGNMENT, Part
 _LOG = logging.getLogger("transport")
 LARGE_BYTES = 32 << 10  # smaller messages are as fast over the network
 _NAME = "mrcdrl-slot"
+_SEALED_NAME = "mrcdrl-sealed"
 _ADDRESS = re.compile(r"([0-9a-f-]{36}) (\d{1,10}) (\d{1,10}) ([0-9a-f]{32})")
 _TOKEN_BYTES = 16
 _MAX_MAPPED = 4096  # one or two a client
@@ -39,6 +41,7 @@ _CHECKED = 2  # buffers looked at when another is mapped: has the client closed 
 _SEALS = (
     fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL if sys.platform == "linux" else 0
 )
+_WRITE_SEAL = fcntl.F_SEAL_WRITE if sys.platform == "linux" else 0
 
 
 class SharedBuffer:
@@ -60,6 +63,35 @@ class SharedBuffer:
         self._map[:_TOKEN_BYTES] = token
         self.address = f"{_boot_id()} {os.getpid()} {self._descriptor} {token.hex()}"
         self.memory = memoryview(self._map)[ALIGNMENT:]
+
+
+class SealedMemory:
+    """A message that any process of this host and user can read while this object lives.
+
+    Raises OSError if the system has no memory to give.
+    """
+
+    def __init__(self, message: Part) -> None:
+        descriptor = os.memfd_create(_SEALED_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        weakref.finalize(self, os.close, descriptor)
+        token = secrets.token_bytes(_TOKEN_BYTES)
+        for part in (token.ljust(ALIGNMENT, b"\0"), message):
+            left = memoryview(part)
+            while left:
+                left = left[os.write(descriptor, left) :]
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, _SEALS | _WRITE_SEAL)
+        self.address = f"{_boot_id()} {os.getpid()} {descriptor} {token.hex()}"
+
+
+def open_sealed(address: str, num_bytes: int) -> memoryview:
+    """The message of a SealedMemory, which stays even if its owner ends.
+
+    Raises SharedMemoryError if it is out of reach.
+    """
+    memory = _map(address, _SEALED_NAME, _WRITE_SEAL)
+    if len(memory) != num_bytes:
+        raise SharedMemoryError(f"{len(memory)} bytes where {num_bytes} are due")
+    return memory
 
 
 class BufferPool:
@@ -138,7 +170,7 @@ class OpenedBuffers:
         """Look at some in turn, so that a further one costs the same however many are mapped."""
         for _ in range(min(_CHECKED, len(self._to_check))):
             address, _ = self._to_check.popitem(last=False)
-            if _is_buffer(_path(address)):
+            if _is_named(_path(address), _NAME):
                 self._to_check[address] = None
             else:
                 del self._mapped[address]
@@ -159,27 +191,29 @@ def _path(address: str) -> Path:
     return Path("/proc") / match[2] / "fd" / match[3]
 
 
-def _is_buffer(path: Path) -> bool:
+def _is_named(path: Path, name: str) -> bool:
     try:
-        return str(path.readlink()).startswith(f"/memfd:{_NAME}")
+        return str(path.readlink()).startswith(f"/memfd:{name}")
     except OSError:
         return False
 
 
-def _map(address: str) -> memoryview:
-    path = _path(address)
-    if not _is_buffer(path):
+def _map(address: str, name: str = _NAME, more_seals: int = 0) -> memoryview:
+    """The memory of a memfd of this name; to be read only, if it is sealed against writing."""
+    path, seals = _path(address), _SEALS | more_seals
+    if not _is_named(path, name):
         raise SharedMemoryError("another container or user")
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        descriptor = os.open(path, (os.O_RDONLY if more_seals else os.O_RDWR) | os.O_CLOEXEC)
     except OSError as error:
         raise SharedMemoryError(f"not to be opened: {error.strerror}") from error
     try:
         # Once open it cannot be swapped for another file; sealed, it cannot shrink.
-        sealed = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & _SEALS == _SEALS
+        sealed = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & seals == seals
         if not sealed or os.fstat(descriptor).st_size <= ALIGNMENT:
             raise SharedMemoryError("no sealed memory")
-        mapped = mmap.mmap(descriptor, 0)
+        access = mmap.ACCESS_READ if more_seals else mmap.ACCESS_DEFAULT
+        mapped = mmap.mmap(descriptor, 0, access=access)
     except (OSError, ValueError) as error:
         raise SharedMemoryError(f"not to be mapped: {error}") from error
     finally:

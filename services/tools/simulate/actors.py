@@ -32,11 +32,13 @@ from mrcdrl.common.messages.trajectory import (
     InsertReply,
     Outcome,
     UInt8Array,
+    Weights,
 )
-from mrcdrl.common.messages.wire import encode, learner_step_of
+from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.claim import claim_name
 from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.sync.weights import WeightsReader
 from mrcdrl.common.transport import Session
 from mrcdrl.common.transport.keys import Keys
 from mrcdrl.services.actor.chunker import Chunker, ChunkerConfig
@@ -190,7 +192,7 @@ class SimulatedActor:
         self.weights_s: list[float] = []
         session.announce(keys.live("actor", worker))
         self._lease = LeaseClient(session, keys, worker, config.exploration.lease_s)
-        self._weights = session.latest_subscriber(keys.weights)
+        self._weights = WeightsReader(session, keys)
         self._summaries = session.publisher(keys.episodes(worker))
         self._reporter = StatsReporter(
             session.publisher(keys.stats("actor", worker)), "actor", worker
@@ -209,9 +211,10 @@ class SimulatedActor:
 
     def look(self) -> None:
         """Take new weights, renew the lease and publish statistics, where these are due."""
-        weights = self._weights.take()
+        weights = self._weights.latest()
         if weights is not None:
-            self.counts.update(weights=1, weights_bytes=len(weights))
+            self.counts.update(weights=1)
+            self.counts["weights_bytes"] = self._weights.fetched_bytes
             self.weights_s.append(monotonic() - published_s(weights))
         self._lease.follow()
         self._reporter.publish_if_due(self._metrics)
@@ -325,12 +328,12 @@ class SimulatedActors:
         self._sessions.close()
 
 
-def published_s(weights: bytes) -> float:
+def published_s(weights: Weights) -> float:
     """When a simulated learner published these weights, on this machine's monotonic clock.
 
-    It says so, in nanoseconds, in the place of its step. Raises WireError if they are no weights.
+    It says so, in nanoseconds, in the place of its step.
     """
-    return 1e-9 * learner_step_of(weights)
+    return 1e-9 * weights.learner_step
 
 
 def episode_chunks(config: Config) -> list[Chunk]:

@@ -26,6 +26,7 @@ from mrcdrl.common.messages.trajectory import (
     Samples,
     Stats,
     Weights,
+    WeightsNotice,
 )
 from mrcdrl.common.messages.wire import encode_parts
 from mrcdrl.common.model.q_network import QNetwork
@@ -40,11 +41,12 @@ PAYLOAD_S = 1.4e-9  # a byte of records that crosses the network
 STATS_S = 0.13e-3  # a statistics message, including everything else that an idle actor costs
 # and of the process that relays (the router, or replay if there is none), for
 RELAYED_BYTE_S = 0.58e-9  # a byte of weights, per receiver
+RELAYED_NOTICE_S = 0.02e-3  # a notice, per receiver
 RELAYED_QUERY_S = 0.14e-3  # a request and its answer
 
 CORE = 0.9  # fraction of a core that one Python process can use
 LINK_BYTES = 1.25e9 * 0.8  # per second: four fifths of 10 Gbit/s
-EVALUATORS = 1
+ACTORS_PER_HOST = 32  # assumed: one process of a host asks for weights, for all of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,11 @@ class Pace:
     transitions_per_s: float  # of all actors
     publications_per_s: float
 
+    @property
+    def hosts(self) -> int:
+        """Hosts besides the learner's."""
+        return math.ceil(self.actors / ACTORS_PER_HOST)
+
     @classmethod
     def free(cls, actors: int, rate: float, publications_per_s: float = 1.0) -> "Pace":
         """Actors do not wait for the learner. rate: robot steps per second of an actor."""
@@ -93,7 +100,7 @@ class Pace:
         if learner.publish_interval_s:
             publications_per_s = min(publications_per_s, 1 / learner.publish_interval_s)
         if learner.publish_bytes_per_s:
-            fan_out_bytes = weights_bytes(config) * (actors + EVALUATORS)
+            fan_out_bytes = weights_bytes(config) * math.ceil(actors / ACTORS_PER_HOST)
             publications_per_s = min(
                 publications_per_s, learner.publish_bytes_per_s / fan_out_bytes
             )
@@ -119,14 +126,15 @@ def flows(config: Config, pace: Pace) -> list[Flow]:
     samples_per_s = pace.transitions_per_s * config.replay.samples_per_insert
     size = config.learner.sample_size
     episodes_per_s = pace.transitions_per_s / EPISODE_FRAMES / config.arena.num_robots
-    listeners = pace.actors + EVALUATORS
     request, samples = SampleRequest(size), _samples(config, size)
     found = [
         Flow("chunks", "actor → replay", chunk_bytes, chunks_per_s),
         Flow("acknowledgements", "replay → actor", _size(InsertReply(10**5, False, 10**8)),
              chunks_per_s),
-        Flow("weights", "learner → actors", weights_bytes(config),
-             pace.publications_per_s * listeners),
+        Flow("notices of weights", "learner → actors", _size(_notice()),
+             pace.publications_per_s * pace.actors),
+        Flow("weights", "learner → hosts", weights_bytes(config),
+             pace.publications_per_s * pace.hosts),
         Flow("statistics", "actor → watchers", _size(_stats()), pace.actors),
         Flow("episodes", "actor → watchers", _size(_episode()), episodes_per_s),
         Flow("sample requests", "learner → replay", _size(request), samples_per_s / size),
@@ -152,7 +160,10 @@ def need(config: Config, pace: Pace) -> Need:
         inserts=chunks.per_s, chunks=chunks.per_s, samples=sampled
     )
     relay_cores = relay_cpu(
-        pace.actors, by_name["weights"].bytes_per_s, queries=chunks.per_s + samples.per_s
+        pace.actors,
+        by_name["weights"].bytes_per_s,
+        queries=chunks.per_s + samples.per_s,
+        notices=by_name["notices of weights"].per_s,
     )
     through = sum(flow.bytes_per_s for flow in by_name.values())
     full = {
@@ -176,9 +187,12 @@ def replay_cpu(*, inserts: float, chunks: float, samples: float) -> float:
     return inserts * INSERT_S + chunks * CHUNK_S + samples / 128 * SAMPLE_S
 
 
-def relay_cpu(actors: int, weights_bytes_per_s: float, *, queries: float) -> float:
-    """Cores to relay the actors' statistics, the weights to each actor, and queries."""
+def relay_cpu(
+    actors: int, weights_bytes_per_s: float, *, queries: float, notices: float = 0.0
+) -> float:
+    """Cores to relay the actors' statistics, weights and notices of them, and queries."""
     passed = weights_bytes_per_s * RELAYED_BYTE_S + queries * RELAYED_QUERY_S
+    passed += notices * RELAYED_NOTICE_S
     return actors * STATS_S + passed
 
 
@@ -233,6 +247,11 @@ def _samples(config: Config, size: int) -> Samples:
         weights_versions=np.full(size, 10**5),
         records=np.zeros((size, window, config.arena.record_bytes), np.uint8),
     )
+
+
+def _notice() -> WeightsNotice:
+    address = f"{'0' * 36} {10**6} 100 {'0' * 32}"
+    return WeightsNotice(2**60, 10**5, 10**6, "0" * 64, 10**7, address)
 
 
 def _stats() -> Stats:

@@ -284,6 +284,7 @@ class Simulation:
             "inserts_per_s": round(self._rate("requests"), 1),
             "chunk_bytes": round(fmean(sum(map(len, encode_parts(c))) for c in chunks), 1),
             "insert_ms": inserts,
+            "fair_turn_ms": self._fair_turn_ms(),
             "held": self._count("throttled"),
             "held_share": round(throttled, 3),
             "unanswered": self._count("unanswered"),
@@ -306,6 +307,11 @@ class Simulation:
             "busy_cores": None if busy is None else round(busy, 2),
             "first_limit": bottleneck(load),
         }
+
+    def _fair_turn_ms(self) -> float | None:
+        """How long each insert takes if actors that all ask all the time are served in turn."""
+        requests_per_s = self._rate("requests")
+        return round(1000 * self._demand.actors / requests_per_s, 1) if requests_per_s else None
 
     def _lost(self, acknowledged: int) -> int | None:
         """Transitions that were acknowledged and that replay does not count.

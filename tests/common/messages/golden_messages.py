@@ -28,8 +28,10 @@ from mrcdrl.common.messages.trajectory import (
     Samples,
     Stats,
     Weights,
+    WeightsNotice,
 )
 from mrcdrl.common.messages.wire import encode, encode_parts
+from mrcdrl.common.runtime.files import sha256
 
 GOLDEN = Path(__file__).parent / "golden"
 STARTED_NS = 1_700_000_000_123_456_789
@@ -83,6 +85,10 @@ MESSAGES: dict[str, Any] = {
     "lease_request": LeaseRequest("actor-0", STARTED_NS, -1, False, False),
     "lease_reply": LeaseReply(2, 2, 8, 15.0),
     "weights": Weights.of(STARTED_NS, 42, 4_200, b"a safetensors file"),
+    "weights_notice": WeightsNotice(
+        *(STARTED_NS, 42, 4_200, sha256(b"a safetensors file"), 18),
+        "01234567-89ab-cdef-0123-456789abcdef 7 11 00112233445566778899aabbccddeeff",
+    ),
     "episode": EpisodeSummary("actor-0", 3, 1, Outcome.TIMEOUT, 1000, 12.5, 2, 0.1, 41, 3.75, 2),
     "evaluation": Evaluation(
         worker="evaluator-0",

@@ -29,6 +29,7 @@ from mrcdrl.common.messages.trajectory import (
     Samples,
     Stats,
     Weights,
+    WeightsNotice,
 )
 from mrcdrl.common.messages.wire import decode, encode, encode_parts
 
@@ -162,6 +163,15 @@ MESSAGES = st.one_of(
     ),
     st.builds(Weights.of, epoch=TIMES_NS, version=COUNTS, learner_step=COUNTS, payload=st.binary()),
     st.builds(
+        WeightsNotice,
+        epoch=TIMES_NS,
+        version=COUNTS,
+        learner_step=COUNTS,
+        digest=st.text("0123456789abcdef", min_size=64, max_size=64),
+        num_bytes=st.integers(1, 2**30),
+        address=st.text(max_size=128),
+    ),
+    st.builds(
         Stats,
         role=NAMES,
         id=NAMES,
@@ -181,6 +191,7 @@ CLASSES = (
     LeaseRequest,
     LeaseReply,
     Weights,
+    WeightsNotice,
     Stats,
 )
 

@@ -31,9 +31,11 @@ SERVED = {
     "sample": RUN.sample(),
     "priorities": RUN.priorities(),
     "weights": RUN.weights,
+    "notice": RUN.weights_notice,
 }
 PUBLISHED = {
     "weights": RUN.weights,
+    "notice": RUN.weights_notice,
     "episodes": RUN.episodes("w"),
     "evaluation": RUN.evaluation("w"),
     **{f"stats of {role}": RUN.stats(role, "w") for role in ROLES},
@@ -64,21 +66,21 @@ MAY = {
         announce=("live replay",),
     ),
     "learner": Row(
-        put=("weights", "stats of learner"),
+        put=("weights", "notice", "stats of learner"),
         ask=("config", "sample", "priorities"),
-        serve=("weights",),
+        serve=("weights", "notice"),
         announce=("live learner",),
     ),
     "actor": Row(
         put=("episodes", "arena of actor", "stats of actor"),
-        follow=("weights",),
-        ask=("config", "leases", "insert", "weights"),
+        follow=("weights", "notice"),
+        ask=("config", "leases", "insert", "weights", "notice"),
         announce=("live actor",),
     ),
     "evaluator": Row(
         put=("evaluation", "arena of evaluator", "stats of evaluator"),
-        follow=("weights",),
-        ask=("config", "weights"),
+        follow=("weights", "notice"),
+        ask=("config", "weights", "notice"),
         announce=("live evaluator",),
     ),
     "status": Row(
@@ -88,13 +90,14 @@ MAY = {
     ),
     "viewer": Row(
         follow=(
-            *("weights", "episodes", "evaluation", "arena of actor", "arena of evaluator"),
+            *("weights", "notice", "episodes", "evaluation"),
+            *("arena of actor", "arena of evaluator"),
             *(f"stats of {role}" for role in ROLES),
         ),
-        ask=("config", "weights"),
+        ask=("config", "weights", "notice"),
         watch=tuple(LIVE),
     ),
-    "robot": Row(follow=("weights",), ask=("config", "weights")),
+    "robot": Row(follow=("weights", "notice"), ask=("config", "weights", "notice")),
 }
 
 

@@ -24,8 +24,8 @@ from mrcdrl.common.errors import (
     UnreachableError,
     WireError,
 )
-from mrcdrl.common.messages.trajectory import Weights
-from mrcdrl.common.messages.wire import encode
+from mrcdrl.common.messages.trajectory import Weights, WeightsNotice
+from mrcdrl.common.messages.wire import decode, encode
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.claim import claim_name
 from mrcdrl.common.sync.weights import WeightsReader, WeightsWriter
@@ -56,9 +56,12 @@ class Network:
         self._max_bytes = max_message_bytes
         self._sessions: list[Session] = []
 
-    def join(self) -> Session:
+    def join(self, *, shared_memory: bool = True) -> Session:
         config = TransportConfig(
-            connect=(self.endpoint,), max_message_bytes=self._max_bytes, timeout_s=PATIENCE_S
+            connect=(self.endpoint,),
+            max_message_bytes=self._max_bytes,
+            timeout_s=PATIENCE_S,
+            shared_memory=shared_memory,
         )
         session = Session(config)
         self._sessions.append(session)
@@ -443,28 +446,53 @@ def test_who_joins_late_gets_the_newest_weights_without_another_publication(
     assert reader.wait(StopSignal()) == weights(0, 2)
 
 
-def test_weights_are_published_as_often_as_their_readers_allow(network: Network) -> None:
-    """Two readers have nearly forever to receive the first; the end waits for nobody."""
-    session, stop = network.join(), StopSignal()
-    claim_name(session, KEYS, "actor", "a", stop)
-    claim_name(session, KEYS, "evaluator", "e", stop)
-    follower = network.join().latest_subscriber(KEYS.weights)
-    until_known(network.join().publisher(KEYS.weights), follower.take)
+def test_weights_are_announced_as_often_as_those_who_ask_for_them_allow(network: Network) -> None:
+    """What one reader of another host took is spent nearly never; the end waits for nobody."""
+    far = network.join(shared_memory=False)
+    reader = WeightsReader(far, KEYS)
+    follower = network.join().latest_subscriber(KEYS.weights_notice)
+    until_known(network.join().publisher(KEYS.weights_notice), follower.take)
     with closing(WeightsWriter(network.join(), KEYS, bytes_per_s=0.01)) as writer:
         writer.publish(weights(0, 1))
-        eventually(lambda: writer.publications == 1 and writer._readers == 2)
+        assert version_of(follower.take(PATIENCE_S)) == 1
+        assert reader.wait(StopSignal()) == weights(0, 1)
         writer.publish(weights(0, 2))
-        assert follower.take(PATIENCE_S) == encode(weights(0, 1))
         assert follower.take(0.5) is None
-        assert WeightsReader(network.join(), KEYS).wait(StopSignal()) == weights(0, 2)
-    assert follower.take(PATIENCE_S) == encode(weights(0, 2))
+        assert WeightsReader(network.join(), KEYS).wait(StopSignal()) == weights(0, 1)
+    assert version_of(follower.take(PATIENCE_S)) == 2
 
 
-def test_without_readers_weights_are_published_at_once(network: Network) -> None:
+def version_of(notice: bytes | None) -> int:
+    assert notice is not None
+    return decode(WeightsNotice, notice).version
+
+
+def test_readers_of_the_learners_host_cost_its_link_nothing(network: Network) -> None:
     with closing(WeightsWriter(network.join(), KEYS, bytes_per_s=0.01)) as writer:
-        for version in range(3):
+        reader = WeightsReader(network.join(), KEYS)
+        writer.publish(weights(0, 1))
+        assert reader.wait(StopSignal()) == weights(0, 1)
+        for version in range(2, 5):
             writer.publish(weights(0, version))
-            eventually(lambda due=version + 1: writer.publications == due)
+            assert reader.latest(PATIENCE_S) == weights(0, version)
+
+
+def test_whoever_subscribes_to_weights_in_full_gets_them(network: Network) -> None:
+    follower = network.join().latest_subscriber(KEYS.weights)
+    with closing(WeightsWriter(network.join(), KEYS)) as writer:
+        eventually(lambda: writer._whole.watched)
+        writer.publish(weights(0, 1))
+        assert follower.take(PATIENCE_S) == encode(weights(0, 1))
+
+
+@pytest.mark.parametrize("shared_memory", [True, False])
+def test_readers_follow_wherever_they_are(network: Network, *, shared_memory: bool) -> None:
+    with closing(WeightsWriter(network.join(), KEYS)) as writer:
+        reader = WeightsReader(network.join(shared_memory=shared_memory), KEYS)
+        for version in range(5):
+            writer.publish(weights(0, version))
+            found = reader.wait(StopSignal()) if version == 0 else reader.latest(PATIENCE_S)
+            assert found == weights(0, version)
 
 
 def test_who_waits_gets_the_first_weights(network: Network, writer: WeightsWriter) -> None:
@@ -488,7 +516,7 @@ def test_weights_never_go_back(network: Network, writer: WeightsWriter, older: W
     reader = WeightsReader(network.join(), KEYS)
     writer.publish(weights(1, 5))
     assert reader.wait(StopSignal()) == weights(1, 5)
-    reader.latest(0.2)  # the same, by the subscription
+    reader.latest(0.2)  # its notice, by the subscription
     writer.publish(older)
     assert reader.latest(0.2) is None
     writer.publish(weights(2, 0))
@@ -497,7 +525,7 @@ def test_weights_never_go_back(network: Network, writer: WeightsWriter, older: W
 
 def test_foreign_weights_are_counted_and_dropped(network: Network, writer: WeightsWriter) -> None:
     reader = WeightsReader(network.join(), KEYS)
-    publisher = network.join().publisher(KEYS.weights)
+    publisher = network.join().publisher(KEYS.weights_notice)
     publisher.put(b"nonsense")
     eventually(lambda: reader.latest(0.1) is None and reader.refused == 1)
     writer.publish(weights(0, 1))
@@ -529,6 +557,51 @@ def test_nobody_at_the_endpoint_is_one_line() -> None:
 def test_an_endpoint_that_is_none_is_refused(side: str, endpoint: str) -> None:
     with pytest.raises(EndpointError, match=endpoint):
         Session(TransportConfig.model_validate({side: (endpoint,)}), open_timeout_s=0.0)
+
+
+class Deaf:
+    """A TCP relay to a router, through which its first clients are let in and then never heard."""
+
+    def __init__(self, endpoint: str, clients: int) -> None:
+        self._to = endpoint.removeprefix("tcp/").rsplit(":", 1)
+        self._left = clients
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._serve(self._accept)
+
+    def close(self) -> None:
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while True:
+            client, _ = self._listener.accept()
+            router = socket.create_connection((self._to[0], int(self._to[1])))
+            heard = 2 if self._left > 0 else None  # the two messages by which a client joins
+            self._left -= 1
+            self._serve(lambda a=client, b=router, n=heard: self._pass_on(a, b, n))
+            self._serve(lambda a=router, b=client: self._pass_on(a, b, None))
+
+    def _pass_on(self, source: socket.socket, sink: socket.socket, messages: int | None) -> None:
+        while data := source.recv(1 << 16):
+            if messages is None or messages > 0:
+                sink.sendall(data)
+            messages = None if messages is None else messages - 1
+        sink.close()
+
+    def _serve(self, work: Callable[[], None]) -> None:
+        def quietly() -> None:
+            with suppress(OSError):
+                work()
+
+        threading.Thread(target=quietly, daemon=True).start()
+
+
+def test_a_session_that_is_let_in_and_not_heard_is_opened_again(network: Network) -> None:
+    follower = network.join().latest_subscriber(KEY)
+    with closing(Deaf(network.endpoint, clients=2)) as relay:
+        config = TransportConfig(connect=(relay.endpoint,), timeout_s=1.0)
+        with Session(config, open_timeout_s=PATIENCE_S) as session:
+            until_known(session.publisher(KEY), follower.take)
 
 
 def test_without_an_endpoint_nothing_is_opened() -> None:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -10,7 +11,7 @@ import pytest
 from mrcdrl.common.config import TransportConfig, load_config
 from mrcdrl.common.errors import CheckpointError
 from mrcdrl.common.messages.metrics import EvaluatorMetrics, read
-from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights
+from mrcdrl.common.messages.trajectory import Evaluation, Stats, Weights, WeightsNotice
 from mrcdrl.common.messages.wire import decode_published, encode
 from mrcdrl.common.model.q_network import QNetwork
 from mrcdrl.common.model.weights_io import weights_to_bytes
@@ -18,7 +19,10 @@ from mrcdrl.common.runtime.heartbeat import FILE_VARIABLE, Pulse
 from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.sync.joining import Joining
 from mrcdrl.common.sync.stats import StatsReporter
+from mrcdrl.common.sync.weights import WeightsWriter
 from mrcdrl.common.transport import Session, free_endpoint
+from mrcdrl.common.transport.keys import Keys
+from mrcdrl.common.transport.shared_memory import SealedMemory
 from mrcdrl.services.evaluator.evaluator import BestWeights, Evaluator
 from tests.patience import eventually
 
@@ -39,9 +43,24 @@ def session() -> Iterator[Session]:
         yield opened
 
 
-def weights(epoch: int, version: int, view_px: int = 32) -> bytes:
+def weights(epoch: int, version: int, view_px: int = 32) -> Weights:
     network = QNetwork(CONFIG.agent.kind, view_px=view_px)
-    return encode(Weights.of(epoch, version, 10 * version, weights_to_bytes(network)))
+    return Weights.of(epoch, version, 10 * version, weights_to_bytes(network))
+
+
+class Announcer:
+    """Announces weights as a learner of this host, in any order."""
+
+    def __init__(self, session: Session, keys: Keys) -> None:
+        self._publisher = session.publisher(keys.weights_notice)
+        self._memories: list[SealedMemory] = []
+
+    def put(self, weights: Weights) -> None:
+        memory = SealedMemory(weights.payload)
+        self._memories.append(memory)
+        size = len(weights.payload)
+        of = (*weights.order, weights.learner_step, weights.digest, size, memory.address)
+        self._publisher.put(encode(WeightsNotice(*of)))
 
 
 def test_each_frame_is_work_and_only_the_first_may_take_minutes(
@@ -60,13 +79,11 @@ def test_each_frame_is_work_and_only_the_first_may_take_minutes(
 
     monkeypatch.setattr("mrcdrl.services.evaluator.evaluator.play", play)
     joining, stop = Joining("judged", "e", tmp_path, TransportConfig(), {}), StopSignal()
-    server = session.server(joining.keys.weights)
-    thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
-    thread.start()
-    while thread.is_alive():
-        request = server.take(0.1)
-        if request is not None:
-            request.reply(weights(1, 1))
+    with closing(WeightsWriter(session, joining.keys)) as writer:
+        writer.publish(weights(1, 1))
+        thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
+        thread.start()
+        thread.join()
     first, second, third = pulses
     assert (first.patience_s, second.patience_s, third.patience_s) == (600, 0, 0)
     assert first.worked_s < second.worked_s < third.worked_s
@@ -79,7 +96,7 @@ def test_refused_weights_are_told_and_do_not_block_good_ones(
     keys = joining.keys
     statistics = session.queue_subscriber(keys.stats("evaluator", "e"))
     results = session.queue_subscriber(keys.evaluation("e"))
-    publisher = session.publisher(keys.weights)
+    publisher = Announcer(session, keys)
     thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
     thread.start()
     judged: list[tuple[int, int]] = []
@@ -122,7 +139,7 @@ def test_a_full_disk_under_the_best_weights_ends_no_evaluator(
     full = CheckpointError("weights best.safetensors not written: No space left on device")
     monkeypatch.setattr(BestWeights, "offer", MagicMock(side_effect=full))
     results = session.queue_subscriber(joining.keys.evaluation("e"))
-    publisher = session.publisher(joining.keys.weights)
+    publisher = Announcer(session, joining.keys)
     thread = threading.Thread(target=Evaluator(CONFIG, joining, session, stop).run)
     thread.start()
     try:
