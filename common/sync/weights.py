@@ -60,7 +60,7 @@ class WeightsWriter:
         self._newest: Weights | None = None
         self._published: Weights | None = None
         self._answers: dict[str, bytes] = {}  # the newest by key, once announced
-        self._answered = 0  # bytes since the last notice
+        self._answered = 0  # bytes of weights since the last notice
         self._stopping = False
         servers = [(key, session.server(key)) for key in (keys.weights, keys.weights_notice)]
         self._threads = [threading.Thread(target=self._publish, name="weights-publish")] + [
@@ -86,11 +86,13 @@ class WeightsWriter:
             thread.join()
 
     def _publish(self) -> None:
+        began_s = 0.0
         while True:
             with self._changed:
                 self._changed.wait_for(
                     lambda: self._newest is not self._published or self._stopping
                 )
+                self._await_link(began_s)
                 weights = self._newest
                 if weights is None or weights is self._published:
                     return
@@ -107,7 +109,6 @@ class WeightsWriter:
                 self.publications += 1
             except TransportError as error:
                 _LOG.warning("weights not published: %s", error)
-            self._rest(began_s)
 
     def _notice_of(self, weights: Weights) -> WeightsNotice:
         """The notice of weights, which are put into sealed memory if there is some."""
@@ -125,14 +126,16 @@ class WeightsWriter:
             *weights.order, weights.learner_step, weights.digest, len(weights.payload), address
         )
 
-    def _rest(self, began_s: float) -> None:
-        """Wait until what these weights have taken of the link is spent, or for `close`."""
-        with self._changed:
-            while self._bytes_per_s and not self._stopping:
-                left_s = began_s + self._answered / self._bytes_per_s - time.monotonic()
-                if left_s <= 0:
-                    return
-                self._changed.wait(left_s)
+    def _await_link(self, began_s: float) -> None:
+        """Wait until what the weights of then have taken of the link is spent, or for `close`.
+
+        Called with the lock, which is released meanwhile.
+        """
+        while self._bytes_per_s and not self._stopping:
+            left_s = began_s + self._answered / self._bytes_per_s - time.monotonic()
+            if left_s <= 0:
+                return
+            self._changed.wait(left_s)
 
     def _serve(self, key: str, server: Server) -> None:
         while not self._stopping:
@@ -143,8 +146,9 @@ class WeightsWriter:
             if answer is None:
                 request.throttle("no weights yet")
                 continue
-            with self._changed:
-                self._answered += len(answer)
+            if key == self._keys.weights:
+                with self._changed:
+                    self._answered += len(answer)
             request.reply(answer)
 
 
@@ -166,7 +170,8 @@ class WeightsReader:
         silence_s: float = _SILENCE_S,
     ) -> None:
         whom, low = "the learner", Priority.LOW
-        self._subscriber = session.latest_subscriber(keys.weights_notice, _Noticed.of)
+        self._shares_memory = session.shares_memory
+        self._subscriber = session.latest_subscriber(keys.weights_notice, self._opened)
         self._notices = session.client(keys.weights_notice, whom, timeout_s=2.0, priority=low)
         self._wholes = session.client(keys.weights, whom, priority=low)
         self._host = HostShare(keys.run, enabled=session.shares_memory)
@@ -212,7 +217,7 @@ class WeightsReader:
         logged, deadline = False, time.monotonic() + timeout_s
         while not stop.is_set() and time.monotonic() < deadline:
             with contextlib.suppress(TransportError):  # no learner yet; asked again
-                self._note(_Noticed.of(self._notices.ask(b"").result()))
+                self._note(self._opened(self._notices.ask(b"").result()))
             weights = self.latest(_RETRY_S)
             if weights is not None:
                 return weights
@@ -221,6 +226,21 @@ class WeightsReader:
                 logged = True
             meanwhile()
         return None
+
+    def _opened(self, payload: Part) -> "_Noticed | WireError":
+        """A notice with the memory that it names; an unreadable one is returned as its error.
+
+        Called by Zenoh's thread, too.
+        """
+        try:
+            notice = decode(WeightsNotice, payload)
+        except WireError as error:
+            return error
+        memory = None
+        if notice.address and self._shares_memory:
+            with contextlib.suppress(SharedMemoryError):
+                memory = open_sealed(notice.address, notice.num_bytes)
+        return _Noticed(notice, memory)
 
     def _note(self, noticed: "_Noticed | WireError | None") -> None:
         """Keep a notice if its weights are newer than all that are known of."""
@@ -296,7 +316,7 @@ class WeightsReader:
         if self._asked.wait(0.0):
             asked, self._asked = self._asked, None
             with contextlib.suppress(TransportError):
-                self._note(_Noticed.of(asked.result()))
+                self._note(self._opened(asked.result()))
 
     def _adopted(self, weights: Weights | None) -> Weights | None:
         """The weights once they are adopted; None if they are not newer, or refused."""
@@ -324,16 +344,3 @@ class _Noticed:
 
     notice: WeightsNotice
     memory: memoryview | None  # None: on another host
-
-    @classmethod
-    def of(cls, payload: Part) -> "_Noticed | WireError":
-        """Open what a notice names; an unreadable one is returned as its error."""
-        try:
-            notice = decode(WeightsNotice, payload)
-        except WireError as error:
-            return error
-        memory = None
-        if notice.address:
-            with contextlib.suppress(SharedMemoryError):
-                memory = open_sealed(notice.address, notice.num_bytes)
-        return cls(notice, memory)

@@ -326,8 +326,11 @@ def test_nothing_is_shared_through_a_directory_that_others_may_change(
     assert [*tmp_path.rglob("weights*")] == []
 
 
-def test_weights_of_the_learners_host_come_from_memory_even_after_it_has_ended() -> None:
+def test_weights_of_the_learners_host_come_from_memory_even_after_it_has_ended(
+    here: None,
+) -> None:
     wire = Wire()
+    wire.shares_memory = True
     reader = reader_of(wire)
     memory = SealedMemory(payload_of(1, 1))
     wire.noticed = notice(1, 1, memory.address)
@@ -355,7 +358,7 @@ HERE = "00000000-0000-0000-0000-000000000000"
         "a slot, which can be written",
     ],
 )
-def test_an_address_of_anything_else_is_not_opened(address: str) -> None:
+def test_an_address_of_anything_else_is_not_opened(address: str, here: None) -> None:
     """The reader asks the learner instead."""
     memory, slot = SealedMemory(b"too short"), SharedBuffer(100)
     if address == "gone":
@@ -365,6 +368,7 @@ def test_an_address_of_anything_else_is_not_opened(address: str) -> None:
     elif address.startswith("a slot"):
         address = slot.address
     wire = Wire()
+    wire.shares_memory = True
     reader = reader_of(wire)
     wire.says(message_of(1, 1))
     wire.noticed = notice(1, 1, address)

@@ -89,7 +89,7 @@ def test_a_further_buffer_costs_the_same_however_many_are_mapped(
 ) -> None:
     looked: list[Path] = []
     opened, shared = OpenedBuffers(), [SharedBuffer(10) for _ in range(100)]
-    monkeypatch.setattr(shared_memory, "_is_buffer", lambda path: not looked.append(path))
+    monkeypatch.setattr(shared_memory, "_is_named", lambda path, _name: not looked.append(path))
     for buffer in shared:
         opened.open(buffer.address)
     assert len(looked) <= 3 * len(shared)
@@ -100,7 +100,7 @@ def test_all_buffers_of_dead_clients_are_forgotten_in_turn(monkeypatch: pytest.M
     for buffer in shared[:40]:
         opened.open(buffer.address)
     dead = {Path(buffer.address.split()[2]) for buffer in shared[:40:2]}
-    monkeypatch.setattr(shared_memory, "_is_buffer", lambda path: Path(path.name) not in dead)
+    monkeypatch.setattr(shared_memory, "_is_named", lambda path, _name: Path(path.name) not in dead)
     for buffer in shared[40:]:
         opened.open(buffer.address)
     assert opened._mapped.keys() == {s.address for s in (*shared[1:40:2], *shared[40:])}
@@ -255,7 +255,7 @@ def test_a_buffer_that_is_out_of_reach_later_makes_the_client_ask_over_the_netwo
 ) -> None:
     pair.exchange(SMALL, SMALL)
     with monkeypatch.context() as patched:
-        patched.setattr("mrcdrl.common.transport.shared_memory._is_buffer", lambda _: False)
+        patched.setattr("mrcdrl.common.transport.shared_memory._is_named", lambda *_: False)
         pair.server._buffers = OpenedBuffers()
         taken = pair.thread.submit(pair.server.take, PATIENCE_S)
         pending = pair.client.ask(LARGE)

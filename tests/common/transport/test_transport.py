@@ -565,17 +565,22 @@ class Deaf:
     def __init__(self, endpoint: str, clients: int) -> None:
         self._to = endpoint.removeprefix("tcp/").rsplit(":", 1)
         self._left = clients
+        self._sockets: list[socket.socket] = []
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
         self._serve(self._accept)
 
     def close(self) -> None:
-        self._listener.close()
+        for each in (self._listener, *self._sockets):
+            with suppress(OSError):  # ends who accepts, or receives
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
 
     def _accept(self) -> None:
         while True:
             client, _ = self._listener.accept()
             router = socket.create_connection((self._to[0], int(self._to[1])))
+            self._sockets += [client, router]
             heard = 2 if self._left > 0 else None  # the two messages by which a client joins
             self._left -= 1
             self._serve(lambda a=client, b=router, n=heard: self._pass_on(a, b, n))
@@ -586,7 +591,7 @@ class Deaf:
             if messages is None or messages > 0:
                 sink.sendall(data)
             messages = None if messages is None else messages - 1
-        sink.close()
+        sink.shutdown(socket.SHUT_RDWR)
 
     def _serve(self, work: Callable[[], None]) -> None:
         def quietly() -> None:
