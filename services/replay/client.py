@@ -14,6 +14,7 @@ from mrcdrl.common.errors import DeadlineError, RefusedError, ThrottledError, Wi
 from mrcdrl.common.messages.framing import join_set
 from mrcdrl.common.messages.trajectory import (
     Chunk,
+    Float64Array,
     InsertReply,
     Priorities,
     PrioritiesReply,
@@ -145,9 +146,10 @@ class ReplayWriter:
 class ReplayReader:
     """Samples mini-batches from all shards, several requests ahead, several batches a request.
 
-    A reply comes from one shard, chosen in proportion to the shards' total priorities; the
-    probabilities, table size and keys of its samples refer to all shards as one table. A shard
-    that is unreachable or throttles for `late_s` is left out until it answers.
+    A reply comes from one shard. They take turns in proportion to their total priorities, not at
+    random: a shard that chance leaves out for a while would hold its actors. The probabilities,
+    table size and keys of its samples refer to all shards as one table. A shard that is unreachable
+    or throttles for `late_s` is left out until it answers.
     """
 
     def __init__(
@@ -161,7 +163,6 @@ class ReplayReader:
         stop: StopSignal,
         *,
         num_shards: int = 1,
-        seed: int = 0,
         late_s: float = _RETRY_S,
         learner_step: int | None = None,
     ) -> None:
@@ -183,7 +184,7 @@ class ReplayReader:
         self._batch_size = batch_size
         self._batches: Iterator[Samples] = iter(())
         self._patience = _Patience("replay has not answered with a mini-batch", warn_s)
-        self._rng = np.random.default_rng(seed)
+        self._owed = np.zeros(num_shards)  # requests that each shard is behind its share
         self._late_s = late_s
         self._stop = stop
 
@@ -202,7 +203,6 @@ class ReplayReader:
             learner.warn_s,
             stop,
             num_shards=config.replay.shards,
-            seed=learner.seed,
             learner_step=learner_step if config.run.turn_size else None,
         )
 
@@ -232,7 +232,7 @@ class ReplayReader:
         """The mini-batches of the next reply; none if no shard replied in time."""
         eligible = [s for s in self._shards if s.ready() or not s.late] or self._shards
         probabilities = shard_probabilities([shard.total_priority for shard in eligible])
-        index = int(self._rng.choice(len(eligible), p=probabilities)) if len(eligible) > 1 else 0
+        index = self._next_turn(eligible, probabilities)
         chosen = eligible[index]
         if not chosen.ready(self._late_s):
             chosen.late = True
@@ -256,6 +256,14 @@ class ReplayReader:
             shard = self._shards.index(chosen)
             samples = self._as_one_table(samples, shard, float(probabilities[index]))
         return split_samples(samples, self._batch_size)
+
+    def _next_turn(self, eligible: Sequence[ShardStream], probabilities: Float64Array) -> int:
+        """The index of the eligible shard that is the furthest behind its share."""
+        shards = [self._shards.index(shard) for shard in eligible]
+        self._owed[shards] += probabilities
+        index = int(self._owed[shards].argmax())
+        self._owed[shards[index]] -= 1
+        return index
 
     def _as_one_table(self, samples: Samples, shard: int, probability: float) -> Samples:
         """A shard's samples as samples of the table that all shards form together."""

@@ -59,7 +59,7 @@ def test_a_run_that_is_up_gets_what_is_acknowledged_and_no_weights(tmp_path: Pat
     ):
         stats = session.queue_subscriber(Keys(run).every_stats)
         there = session.presence(Keys(run).everyone("actor"))
-        weights = session.latest_subscriber(Keys(run).weights)
+        weights = session.latest_subscriber(Keys(run).weights_notice)
         said: dict[str, Stats] = {}
 
         def inserts() -> float:

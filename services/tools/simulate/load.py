@@ -15,6 +15,7 @@ from mrcdrl.common.messages.trajectory import Float64Array
 _FULL = 0.9  # of a core, above which a process fills it
 _BUSY = 0.95  # of all cores
 _THROTTLED = 0.2  # of replay's reports
+_LATE_MS = 5_000.0
 _ACCEPTED = 0.95  # of what was due
 _NANO = 1e-9
 
@@ -107,18 +108,17 @@ class Load:
     cores: int
     busy: float | None  # of these cores, for any process
     usage: dict[str, Usage]  # by process
-    weights: float | None = None  # fraction of the publications that reached each actor
+    weights_ms: float | None = None  # from their publication to an actor, 99th percentile
     simulating: frozenset[str] = frozenset()  # processes that a real run would have elsewhere
 
 
 def bottleneck(load: Load) -> str:
     """Name the bottleneck, with the figures that show it."""
-    late = 0.0 if load.weights is None else 1 - load.weights
     if math.isfinite(load.due) and load.accepted >= _ACCEPTED * load.due:
-        if late <= 1 - _ACCEPTED:
+        if load.weights_ms is None or load.weights_ms <= _LATE_MS:
             return "none: all transitions due were accepted"
-        missed = f"weights: {late:.0%} of the publications were overtaken by newer ones"
-        return "; ".join(filter(None, (missed, _full(load))))
+        late = f"weights: actors have them {load.weights_ms / 1000:.1f} s after they are published"
+        return "; ".join(filter(None, (late, _full(load))))
     if load.throttled > _THROTTLED:
         return "the rate limiter: the learner does not sample enough to admit more"
     if (full := _full(load)) is not None:

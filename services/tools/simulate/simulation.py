@@ -271,7 +271,7 @@ class Simulation:
             cores,
             busy,
             usage,
-            received,
+            weights["p99"],
             frozenset(self._ours),
         )
         acknowledged = sum(worker.final["transitions"] for worker in self._workers)

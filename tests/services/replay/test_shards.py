@@ -89,7 +89,7 @@ def reader_of(
     session: Session, num_shards: int, stop: StopSignal | None = None, late_s: float = 0.2
 ) -> ReplayReader:
     settings = (BATCH, BATCHES, 2, 10.0, stop or StopSignal())
-    return ReplayReader(session, KEYS, *settings, num_shards=num_shards, seed=3, late_s=late_s)
+    return ReplayReader(session, KEYS, *settings, num_shards=num_shards, late_s=late_s)
 
 
 def sample(reader: ReplayReader, num_batches: int) -> list[Samples]:
@@ -116,7 +116,7 @@ def test_batches_come_in_proportion_to_the_shards_priorities(router: str, sessio
         sample(reader, 40 * BATCHES)  # until both totals are known
         batches = sample(reader, 400 * BATCHES)
     probability = 0.95 * 0.75 + 0.05 / 2
-    assert frequencies(batches)[1] == pytest.approx(probability, abs=0.08)
+    assert frequencies(batches)[1] == pytest.approx(probability, abs=0.01)  # chance would miss that
     for batch in batches:
         assert len(set(batch.rewards.tolist())) == 1
         shard = int(batch.rewards[0])

@@ -67,10 +67,10 @@ LIMITS = {
 def test_weights_that_are_late_are_a_limit_and_the_simulation_tells_its_own_share() -> None:
     usage = {"replay-0": using(0.9), "actors-0": using(0.8), "simulate": using(0.1)}
     ours = frozenset({"actors-0", "simulate"})
-    said = bottleneck(Load(1000, 1000, 0.0, 2.0, 2, 1.98, usage, 0.4, ours))
-    assert said.startswith("weights: 60% of the publications were overtaken by newer ones; ")
+    said = bottleneck(Load(1000, 1000, 0.0, 2.0, 2, 1.98, usage, 12_300.0, ours))
+    assert said.startswith("weights: actors have them 12.3 s after they are published; ")
     assert said.endswith("all others 0.18; the simulation itself took 0.90")
-    assert bottleneck(Load(1000, 1000, 0.0, 2.0, 2, 1.98, usage, 0.99, ours)).startswith("none")
+    assert bottleneck(Load(1000, 1000, 0.0, 2.0, 2, 1.98, usage, 900.0, ours)).startswith("none")
 
 
 @pytest.mark.parametrize(("load", "said"), LIMITS.values(), ids=LIMITS)
