@@ -28,14 +28,16 @@ from tests.system.system_processes import Command, end_all
 _TINY = ["--arena.view_px", "32", "--arena.max_frames", "200", "--actor.num_arenas", "2"]
 _SETTINGS = ["--learner.batch_size", "32", "--run.minutes", "0", "--run.learner_steps", "0"]
 _END_S = 120.0
+_SILENT_S = 10.0  # without statistics: an actor has left
 
 
 class Watcher:
-    """The newest statistics of each process, by role and name."""
+    """The newest statistics of each process, by role and name, and when they came."""
 
     def __init__(self, session: Session, keys: Keys) -> None:
         self._waiting = session.queue_subscriber(keys.every_stats)
         self.newest: dict[tuple[str, str], Stats] = {}
+        self.came_s: dict[tuple[str, str], float] = {}
 
     def look(self, seconds: float) -> None:
         """Read statistics for this long."""
@@ -49,6 +51,7 @@ class Watcher:
             except WireError:
                 continue
             self.newest[stats.role, stats.id] = stats
+            self.came_s[stats.role, stats.id] = time.monotonic()
 
     def total(self, role: str, metric: str) -> float:
         """Sum over the processes of a role."""
@@ -115,13 +118,13 @@ def phase(watcher: Watcher, actors: int, seconds: float) -> dict[str, Any]:
     watcher.look(seconds / 2)
     lasted_s = time.monotonic() - began_s
     ages = [
-        stats.metrics["weights_age_s"]
-        for (role, _), stats in watcher.newest.items()
-        if role == "actor" and "weights_age_s" in stats.metrics
+        stats.metrics.get("weights_age_s", 0.0)
+        for (role, name), stats in watcher.newest.items()
+        if role == "actor" and watcher.came_s[role, name] > time.monotonic() - _SILENT_S
     ]
     return {
         "actors": actors,
-        "heard_of": sum(role == "actor" for role, _ in watcher.newest),
+        "heard_of": len(ages),
         "learner_steps_per_s": (watcher.total("learner", "learner_steps") - before) / lasted_s,
         "inserts_per_s": (watcher.total("replay", "inserts") - inserts) / lasted_s,
         "oldest_weights_s": max(ages, default=None),

@@ -37,10 +37,12 @@ SCALING = Path(__file__).with_name("scaling.md")
 METRICS = Path(__file__).with_name("metrics.md")
 MONITORING = Path(__file__).with_name("monitoring.md")
 TRIALS = Path(__file__).parents[1] / "benchmarks" / "results" / "simulate"
+THOUSAND = TRIALS.with_name("thousand")
+_HELD = 0.5  # share of replay's reports from which on its limiter holds the actors
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.S)
 _RATE = 4300.0  # robot steps per second of an actor with a dedicated core: docs/profile.md
 _UPDATES = 81.4  # per second, by a learner on two cores: benchmarks/results/learner
-_ACTORS = (10, 100, 1000)
+_ACTORS = (10, 100, 1000, 10_000)
 
 _HEAD = """# Configuration
 
@@ -155,7 +157,7 @@ def _cell(text: str) -> str:
 
 def render_scaling(text: str) -> str:
     """The page with its tables generated again."""
-    tables = {"flows": _flows, "needs": _needs, "trials": _trials}
+    tables = {"flows": _flows, "needs": _needs, "trials": _trials, "thousand": _thousand}
     return _TABLE.sub(lambda m: "".join([m[1], *tables[m[2]](), m[3]]), text)
 
 
@@ -225,6 +227,30 @@ def _need(title: str, config: Config, pace: Pace) -> str:
         need.routers,
         need.first,
     )
+
+
+def _thousand() -> Iterator[str]:
+    """Measurements of up to 1 000 actors, beside the model's prediction for replay's processes."""
+    yield _head(
+        *("trial", "actors", "joined, s", "transitions/s", "insert p50, p99, ms", "fair turn, ms"),
+        *("weights p99, ms", "replay, cores", "by the model", "replay, MiB"),
+    )
+    told = [(path.stem, json.loads(path.read_text("utf-8"))) for path in THOUSAND.glob("*.json")]
+    for name, figures in sorted(told, key=lambda each: (each[1]["actors"], each[0])):
+        replays = [used for role, used in figures["processes"].items() if "replay" in role]
+        latency, held = figures["insert_ms"], figures["held_share"] > _HELD
+        yield _row(
+            f"`{name}`",
+            f"{figures['actors']:,}",
+            f"{figures['joined_s']:.1f}",
+            f"{figures['transitions_per_s']:,.0f}",
+            f"{latency['p50']:,.1f}, {latency['p99']:,.0f}",
+            f"{1000 * figures['actors'] / figures['inserts_per_s']:,.0f}" if held else "not held",
+            f"{figures['weights_ms']['p99']:,.0f}",
+            f"{sum(used['cores'] for used in replays):.2f}",
+            f"{scaling.expected(figures):.2f}",
+            f"{sum(used['memory_mib'] for used in replays):,.0f}",
+        )
 
 
 def _trials() -> Iterator[str]:

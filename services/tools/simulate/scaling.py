@@ -41,7 +41,7 @@ PAYLOAD_S = 1.4e-9  # a byte of records that crosses the network
 STATS_S = 0.13e-3  # a statistics message, including everything else that an idle actor costs
 # and of the process that relays (the router, or replay if there is none), for
 RELAYED_BYTE_S = 0.58e-9  # a byte of weights, per receiver
-RELAYED_NOTICE_S = 0.02e-3  # a notice, per receiver
+RELAYED_NOTICE_S = 0.01e-3  # a notice, per receiver
 RELAYED_QUERY_S = 0.14e-3  # a request and its answer
 
 CORE = 0.9  # fraction of a core that one Python process can use
