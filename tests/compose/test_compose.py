@@ -155,6 +155,15 @@ def test_live_weights_are_judged(stack: Stack) -> None:
     assert all(0 <= record["success_rate"] <= 1 for record in records(stack, "evaluations"))
 
 
+def test_containers_of_a_host_share_the_weights_that_one_has_fetched(stack: Stack) -> None:
+    def lock(service: str) -> str:
+        path = "/tmp/mrcdrl-10001/weights-stack.lock"
+        return stack.compose("exec", "-T", service, "stat", "-c", "%i %u %a", path)
+
+    assert lock("actor") == lock("evaluator")
+    assert lock("actor").split()[1:] == ["10001", "600"]
+
+
 def test_more_actors_join(stack: Stack) -> None:
     def at_work() -> set[str]:
         said = stack.status()
