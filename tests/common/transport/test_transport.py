@@ -639,6 +639,19 @@ def test_the_with_block_leaves_neither_session_nor_thread_nor_port() -> None:
         socket.create_connection((host, int(port)), timeout=PATIENCE_S)
 
 
+def test_a_session_that_zenoh_cannot_close_in_time_ends_without_an_error() -> None:
+    class Slow:
+        def is_closed(self) -> bool:
+            return False
+
+        def close(self) -> None:
+            raise zenoh.ZError("timeout")
+
+    with Session(TransportConfig(listen=(free_endpoint(),))) as session:
+        real, session._session = session._session, Slow()  # type: ignore[assignment]
+    real.close()  # type: ignore[no-untyped-call]
+
+
 def test_a_free_endpoint_is_free() -> None:
     with Session(TransportConfig(listen=(free_endpoint(),))) as session:
         assert "open" in repr(session)
