@@ -1,9 +1,11 @@
 """`mrcdrl render`: make a film of evaluation episodes, or a recording for rerun's viewer."""
 
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
 from mrcdrl.common.config import ArenaConfig
+from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Outcome
 from mrcdrl.common.runtime.files import prepare_output
 from mrcdrl.services.evaluator.trial import EpisodeResult
@@ -14,7 +16,8 @@ from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.episode_frames import film_frames, num_film_frames
 from mrcdrl.services.tools.progress import Progress
 from mrcdrl.services.tools.rerun_recording import SUFFIX, check_rerun, write_recording
-from mrcdrl.services.tools.subject import subject
+from mrcdrl.services.tools.subject import Subject, subject
+from mrcdrl.services.tools.world_frames import world_frames
 
 FPS = 30
 
@@ -29,6 +32,8 @@ def main(argv: Sequence[str]) -> int:
         check_rerun()
     shown = subject(arguments)
     arena = shown.config.arena
+    if arena.is_custom:
+        return _render_world(arguments, shown)
     with Progress() as progress:
         done = progress.stage("episodes", arguments.episodes)
         results = shown.episodes(arguments.episodes, arguments.seed, done)
@@ -40,6 +45,34 @@ def main(argv: Sequence[str]) -> int:
     won = sum(result.outcome is Outcome.SUCCESS for result in results)
     print(f"{arguments.out}: {counted(len(results), 'episode')}, {won} succeeded")
     return 0
+
+
+def _render_world(arguments: Namespace, shown: Subject) -> int:
+    if arguments.out.suffix == SUFFIX:
+        raise ConfigError(
+            f"{arguments.out}: recordings show poses, which a custom world does not tell; write a "
+            f"film, {' or '.join(SUFFIXES)}"
+        )
+    with Progress() as progress:
+        outcomes = write_world(arguments.out, shown, arguments.episodes, arguments.seed, progress)
+    won = outcomes.count(Outcome.SUCCESS)
+    print(f"{arguments.out}: {counted(len(outcomes), 'episode')}, {won} succeeded")
+    return 0
+
+
+def write_world(
+    out: Path, shown: Subject, episodes: int, seed: int, progress: Progress
+) -> list[Outcome]:
+    """Film episodes of a custom world as they are played; their outcomes."""
+    outcomes: list[Outcome] = []
+    done = progress.stage(f"{out.name}, episodes", episodes)
+
+    def ended(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        done(len(outcomes))
+
+    write_film(out, world_frames(shown, episodes, seed, ended), FPS)
+    return outcomes
 
 
 def write_episodes(

@@ -10,7 +10,7 @@ from mrcdrl.services.plots.paper import SUFFIXES
 from mrcdrl.services.tools import flags
 from mrcdrl.services.tools.figure import paths_of
 from mrcdrl.services.tools.progress import Progress
-from mrcdrl.services.tools.render import write_episodes
+from mrcdrl.services.tools.render import write_episodes, write_world
 from mrcdrl.services.tools.subject import subject
 
 _EPISODES = 12
@@ -34,11 +34,13 @@ def main(argv: Sequence[str]) -> int:
 def draw_episodes(run_dir: Path, progress: Progress) -> None:
     """Plot and film episodes of the best weights; CheckpointError if the run has no weights.
 
-    A custom world has no poses to draw.
+    A custom world has no poses to draw; it is filmed.
     """
     shown = subject(flags.evaluate().parse_args([str(run_dir)]))
     arena = shown.config.arena
     if arena.is_custom:
+        write_world(run_dir / FILM, shown, _FILMED, _SEED, progress)
+        print(run_dir / FILM)
         return
     results = shown.episodes(_EPISODES, _SEED, progress.stage("episodes", _EPISODES))
     files = plots(run_dir, "trajectories")

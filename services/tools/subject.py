@@ -68,8 +68,8 @@ class Subject:
         """
         if self.config.arena.is_custom:
             raise ConfigError(
-                "films and paths are drawn from the poses of the paper's arena: not yet with a "
-                "custom world, arena.env"
+                "paths are drawn from the poses of the paper's arena: not with a custom world, "
+                "arena.env"
             )
         parts = self.each_number()[::-1]
         played: dict[int, EpisodeResult] = {}
