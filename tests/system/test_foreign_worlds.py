@@ -1,0 +1,37 @@
+"""Worlds that nobody here wrote go round the ring: actor, replay, learner, evaluator, film."""
+
+import json
+from pathlib import Path
+
+import av
+import pytest
+
+from tests.system.system_processes import Command, end_all, run_name
+
+ROOT = Path(__file__).parents[2]
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
+
+
+@pytest.mark.parametrize(("world", "agents", "actions"), [("pong", 2, 3), ("grid", 1, 7)])
+def test_a_foreign_world_is_learned_judged_and_filmed(
+    world: str, agents: int, actions: int, tmp_path: Path
+) -> None:
+    name = run_name("foreign")
+    train = ["train", name, "--run-dir", str(tmp_path), "--config", "smoke", "--no-web"]
+    train += ["--env", f"benchmarks.foreign_worlds:{world}", "--run.learner_steps", "40"]
+    train += ["--evaluator.episodes", "2", "--arena.max_frames", "30", "--replay.min_size", "100"]
+    try:
+        with Command(train, tmp_path, PYTHONPATH=str(ROOT)) as command:
+            assert command.wait(600) == 0, command.err
+    finally:
+        end_all(name)
+    run = tmp_path / name
+    summary = json.loads((run / "summary.json").read_text("utf-8"))
+    assert summary["learner_steps"] >= 40, summary
+    judged = (run / "evaluations.jsonl").read_text("utf-8").splitlines()
+    assert judged
+    settings = (run / "config.toml").read_text("utf-8")
+    assert f"num_robots = {agents}" in settings
+    assert f"num_actions = {actions}" in settings
+    with av.open(str(run / "evaluation.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) > 4
