@@ -172,6 +172,7 @@ def test_volumes_are_there(name: str) -> None:
     mounted = {mount["name"]: mount["mountPath"] for mount in container(name)["volumeMounts"]}
     assert set(mounted) == claims | {volume["name"] for volume in volumes}
     composed = {v.split(":")[1] for v in COMPOSE["services"][name].get("volumes", [])}
+    composed -= {"/tmp/mrcdrl-10001"}  # weights that containers of a host share: pods have none
     assert set(mounted.values()) == composed | {"/tmp"}
     claimed = {
         v["persistentVolumeClaim"]["claimName"]

@@ -88,7 +88,7 @@ class Wire:
 
     def __init__(self) -> None:
         self.noticed: bytes | None = None
-        self.answers: dict[str, bytes] = {}  # by key
+        self.answers: dict[str, bytes] = {}  # by key, without the run
         self.asked: list[str] = []
         self.oversized = 0
 
@@ -101,12 +101,12 @@ class Wire:
         return None if newest is None else self.opened(newest)
 
     def client(self, key: str, *_: Any, **__: Any) -> "WireClient":
-        return WireClient(self, key)
+        return WireClient(self, key.split("/", 2)[2])
 
     def says(self, whole: bytes, epoch: int = 1, version: int = 1) -> None:
         """Announce weights, which the learner then answers with."""
         self.noticed = notice(epoch, version)
-        self.answers = {KEYS.weights: whole, KEYS.weights_notice: notice(epoch, version)}
+        self.answers = {"weights": whole, "weights/notice": notice(epoch, version)}
 
 
 @dataclass
@@ -262,7 +262,7 @@ def test_one_process_of_a_host_asks_and_hands_on(tmp_path: Path, here: None) -> 
     wire.says(message_of(1, 1))
     found += [weights for weights in [late.latest()] if weights is not None]
     assert found == 6 * [Weights.of(1, 1, 10, payload_of(1, 1))]
-    assert wire.asked == [KEYS.weights]
+    assert wire.asked == ["weights"]
     assert {path.name for path in tmp_path.rglob("*run*")} == {"weights-run", "weights-run.lock"}
 
 
@@ -374,7 +374,7 @@ def test_an_address_of_anything_else_is_not_opened(address: str, here: None) -> 
     wire.noticed = notice(1, 1, address)
     found = heard(reader)
     assert found == Weights.of(1, 1, 10, payload_of(1, 1))
-    assert wire.asked == [KEYS.weights]
+    assert wire.asked == ["weights"]
 
 
 def test_sealed_memory_cannot_be_altered() -> None:

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -254,11 +255,17 @@ def test_no_two_processes_hold_a_slot_whatever_happens_to_them(tmp_path: Path) -
             eventually(lambda: first.slot == given_slot, "it has the slot that was given back")
             replay.process.kill()
             replay.wait()
-        with Command(arguments, tmp_path):
+        with Command(arguments, tmp_path) as replay:
+            eventually(lambda: "serving" in replay.err, "replay is back")
+            ended_s = time.monotonic() + lease_s  # of leases that the killed one granted
+            eventually(
+                lambda: time.monotonic() > ended_s and {first.slot, third.slot} == {0, 1},
+                "both have a slot again",
+            )
             fourth = start("actor-1")
-            eventually(lambda: {first.slot, third.slot} == {0, 1}, "both have a slot again")
-            third.process.kill()
+            eventually(lambda: fourth.lines, "one more asks for a slot")
             free_slot = 1 - first.slot
+            third.process.kill()
             eventually(lambda: fourth.slot == free_slot, "it has the slot of the one that died")
     finally:
         for holder in holders:
