@@ -245,7 +245,7 @@ def _thousand() -> Iterator[str]:
             f"{figures['joined_s']:.1f}",
             f"{figures['transitions_per_s']:,.0f}",
             f"{latency['p50']:,.1f}, {latency['p99']:,.0f}",
-            f"{1000 * figures['actors'] / figures['inserts_per_s']:,.0f}" if held else "not held",
+            f"{figures['fair_turn_ms']:,.0f}" if held else "not held",
             f"{figures['weights_ms']['p99']:,.0f}",
             f"{sum(used['cores'] for used in replays):.2f}",
             f"{scaling.expected(figures):.2f}",

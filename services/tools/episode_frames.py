@@ -15,7 +15,7 @@ from mrcdrl.services.evaluator.trial import EpisodeResult
 from mrcdrl.services.plots.film import compose_frame
 
 _ARENA_PX = 600
-_ENDING_FRAMES = 20  # repeats of an episode's last frame
+ENDING_FRAMES = 20  # repeats of an episode's last frame
 
 
 class Moment(NamedTuple):
@@ -43,7 +43,7 @@ def moments(config: ArenaConfig, episodes: Sequence[EpisodeResult]) -> Iterator[
 
 def num_film_frames(episodes: Sequence[EpisodeResult]) -> int:
     """The number of images that `film_frames` yields."""
-    return sum(len(episode.robots) - 1 + _ENDING_FRAMES for episode in episodes)
+    return sum(len(episode.robots) - 1 + ENDING_FRAMES for episode in episodes)
 
 
 def film_frames(
@@ -62,5 +62,5 @@ def film_frames(
         absent = np.zeros((most - len(views), *views.shape[1:]), np.uint8)
         shown = np.concatenate([views, absent])
         image = compose_frame(render_arena(scene, config, _ARENA_PX), shown, caption, note)
-        for _ in range(_ENDING_FRAMES if ending else 1):
+        for _ in range(ENDING_FRAMES if ending else 1):
             yield image

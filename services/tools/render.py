@@ -1,6 +1,5 @@
 """`mrcdrl render`: make a film of evaluation episodes, or a recording for rerun's viewer."""
 
-from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,29 +31,24 @@ def main(argv: Sequence[str]) -> int:
         check_rerun()
     shown = subject(arguments)
     arena = shown.config.arena
-    if arena.is_custom:
-        return _render_world(arguments, shown)
-    with Progress() as progress:
-        done = progress.stage("episodes", arguments.episodes)
-        results = shown.episodes(arguments.episodes, arguments.seed, done)
-        if recorded:
-            progress.stage("recording")
-            write_recording(arguments.out, arena, results)
-        else:
-            write_episodes(arguments.out, arena, results, progress)
-    won = sum(result.outcome is Outcome.SUCCESS for result in results)
-    print(f"{arguments.out}: {counted(len(results), 'episode')}, {won} succeeded")
-    return 0
-
-
-def _render_world(arguments: Namespace, shown: Subject) -> int:
-    if arguments.out.suffix == SUFFIX:
+    if arena.is_custom and recorded:
         raise ConfigError(
             f"{arguments.out}: recordings show poses, which a custom world does not tell; write a "
             f"film, {' or '.join(SUFFIXES)}"
         )
     with Progress() as progress:
-        outcomes = write_world(arguments.out, shown, arguments.episodes, arguments.seed, progress)
+        if arena.is_custom:
+            asked = (arguments.out, shown, arguments.episodes, arguments.seed)
+            outcomes = write_world(*asked, progress)
+        else:
+            done = progress.stage("episodes", arguments.episodes)
+            results = shown.episodes(arguments.episodes, arguments.seed, done)
+            outcomes = [result.outcome for result in results]
+            if recorded:
+                progress.stage("recording")
+                write_recording(arguments.out, arena, results)
+            else:
+                write_episodes(arguments.out, arena, results, progress)
     won = outcomes.count(Outcome.SUCCESS)
     print(f"{arguments.out}: {counted(len(outcomes), 'episode')}, {won} succeeded")
     return 0

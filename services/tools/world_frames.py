@@ -11,10 +11,10 @@ import numpy as np
 from mrcdrl.common.arena import CustomBatch, make_codec, test_starts
 from mrcdrl.common.messages.trajectory import Outcome, UInt8Array
 from mrcdrl.services.plots.film import compose_frame
+from mrcdrl.services.tools.episode_frames import ENDING_FRAMES
 from mrcdrl.services.tools.subject import Subject
 
 _HEIGHT_PX = 480  # up to which the world's picture is enlarged
-_ENDING_FRAMES = 20  # repeats of an episode's last frame
 
 
 def world_frames(
@@ -49,7 +49,7 @@ def world_frames(
                 yield image(steps.records, caption)
                 continue
             last = image(steps.records, f"{caption}   {outcome.value}")
-            for _ in range(_ENDING_FRAMES):
+            for _ in range(ENDING_FRAMES):
                 yield last
             ended(outcome)
 
