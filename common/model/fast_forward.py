@@ -84,7 +84,7 @@ def fast_forward(
     trace, dtype = trace or Trace(), network.compute_dtype
     weight, bias = operands["conv1.weight"], operands["conv1.bias"]
     if isinstance(states, NonzeroPixels):
-        x = sparse_first_layer(states, weight, bias).to(dtype)
+        x = sparse_first_layer(states, weight, bias, dtype)
     elif isinstance(states, Images):
         x = tensor_core_first_layer(states, weight, bias)
     else:

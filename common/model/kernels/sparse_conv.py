@@ -4,8 +4,8 @@ A black pixel adds nothing to a convolution, and 92 to 96 % of an arena's images
 a twelfth of the products is left. `fast_forward.py` gives brighter images to PyTorch's operations,
 which are faster on them.
 
-Invariants: the values are those of PyTorch's operations within the rounding of float32; the same
-images and parameters give the same bits.
+Invariants: the values are those of PyTorch's operations within the rounding of float32, rounded
+once more where bfloat16 is asked for; the same images and parameters give the same bits.
 
 Shapes: B = states, S = images of a state, V = their width, C = channels, P = width when pooled.
 """
@@ -73,30 +73,35 @@ def nonzero_pixels(observation: Tensor) -> NonzeroPixels | None:
     return NonzeroPixels((num, stack, size), ends, columns, intensities)
 
 
-def first_layer(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
-    """max(0, max-pool(convolution)), float32 [B, C, P, P], channels last in memory.
+def first_layer(
+    nonzero: NonzeroPixels, weight: Tensor, bias: Tensor, dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """max(0, max-pool(convolution)), [B, C, P, P], channels last in memory.
 
-    weight: float32 [C, S, 5, 5], for intensities of 0 to 255; bias: float32 [C].
+    weight: float32 [C, S, 5, 5], for intensities of 0 to 255; bias: float32 [C]. dtype: float32 or
+    bfloat16, of the outputs.
     """
     if torch.is_grad_enabled() and weight.requires_grad:
-        outputs: Tensor = _FirstLayer.apply(nonzero, weight, bias)  # type: ignore[no-untyped-call]
+        outputs: Tensor = _FirstLayer.apply(nonzero, weight, bias, dtype)  # type: ignore[no-untyped-call]
         return outputs
-    return _forward(nonzero, weight, bias)[0]
+    return _forward(nonzero, weight, bias, dtype)[0]
 
 
 class _FirstLayer(torch.autograd.Function):
     """The layer with gradients of weight and bias; images have none."""
 
     @staticmethod
-    def forward(ctx: Any, nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> Tensor:
-        pooled, largest = _forward(nonzero, weight, bias)
+    def forward(
+        ctx: Any, nonzero: NonzeroPixels, weight: Tensor, bias: Tensor, dtype: torch.dtype
+    ) -> Tensor:
+        pooled, largest = _forward(nonzero, weight, bias, dtype)
         ctx.nonzero = nonzero
         ctx.save_for_backward(pooled, largest)
         return pooled
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor, Tensor]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor, Tensor, None]:
         nonzero: NonzeroPixels = ctx.nonzero
         _, stack, size = nonzero.shape
         taps = np.zeros((stack, KERNEL, KERNEL, CHANNELS), np.float32)
@@ -105,25 +110,32 @@ class _FirstLayer(torch.autograd.Function):
         pixels = (nonzero.ends, nonzero.columns, nonzero.intensities, size)
         differentiate(*pixels, passed, pooled, largest, taps, bias)
         weight = torch.from_numpy(taps)[:, :, _COLUMNS].permute(3, 0, 1, 2)
-        return None, weight, torch.from_numpy(bias)
+        return None, weight, torch.from_numpy(bias), None
 
 
 _COLUMNS = np.argsort(TAPS).tolist()
 
 
-def _forward(nonzero: NonzeroPixels, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+def _forward(
+    nonzero: NonzeroPixels, weight: Tensor, bias: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
     """The outputs, and which of the four pooled values is the largest, uint8; both [B, C, P, P]."""
     num, stack, size = nonzero.shape
     side = pooled_px(size)
-    pooled = torch.empty(num, side, side, CHANNELS)
+    pooled = torch.empty(num, side, side, CHANNELS, dtype=dtype)
     largest = torch.empty(num, side, side, CHANNELS, dtype=torch.uint8)
     taps = weight.detach().permute(1, 2, 3, 0)[:, :, list(TAPS)].contiguous()
     pixels = (nonzero.ends, nonzero.columns, nonzero.intensities, stack, size)
-    layer(*pixels, taps.numpy(), bias.detach().numpy(), pooled.numpy(), largest.numpy())
+    layer(*pixels, taps.numpy(), bias.detach().numpy(), _array(pooled), largest.numpy())
     return pooled.permute(0, 3, 1, 2), largest.permute(0, 3, 1, 2)
 
 
 def _channels_last(x: Tensor) -> NDArray[Any]:
     """A tensor [B, C, P, P] as an array [B, P, P, C] without gaps."""
-    array: NDArray[Any] = x.detach().permute(0, 2, 3, 1).contiguous().numpy()
+    return _array(x.detach().permute(0, 2, 3, 1).contiguous())
+
+
+def _array(x: Tensor) -> NDArray[Any]:
+    """The tensor's memory as an array; of bfloat16, which numpy lacks, the bits as int16."""
+    array: NDArray[Any] = (x.view(torch.int16) if x.dtype == torch.bfloat16 else x).numpy()
     return array

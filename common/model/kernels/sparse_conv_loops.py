@@ -4,6 +4,9 @@ Everything between pixels and pooled outputs stays in the processor's first-leve
 of outputs at a time. The channels lie side by side, and every operation works on all of them at
 once. Numba does not find these vector operations by itself, so they are written in LLVM's terms.
 
+Where outputs and gradients are to be bfloat16, which numba does not have, their arrays are of its
+bits, int16.
+
 Invariants: pure; the first of equal outputs counts as the largest, and NaN counts as larger than
 any number, both as in PyTorch.
 
@@ -33,6 +36,8 @@ _MARGIN = 2  # outputs left and right of the image, which take what nobody reads
 
 intrinsic: Any = _intrinsic  # its annotations take the first argument for one of the call's
 _FLOAT, _BYTE, _INDEX = ir.FloatType(), ir.IntType(8), ir.IntType(32)
+_HALF, _WORD = ir.IntType(16), ir.IntType(32)  # the bits of bfloat16 and float32
+_QUIET_NAN = 0x7FC0
 _CONTRACT = ("contract",)  # a product and a sum may be rounded once
 
 
@@ -52,6 +57,32 @@ class _Lanes:
 
     def store(self, value: Any, array: Any, number: int, index: Any) -> None:
         self._builder.store(value, self._pointer(array, number, index, value.type), align=1)
+
+    def load_numbers(self, array: Any, number: int, index: Any) -> Any:
+        """Load float32 from an array of float32, or of the bits of bfloat16."""
+        if self._types[number].dtype == types.float32:
+            return self.load(array, number, index)
+        bits = self._builder.zext(
+            self.load(array, number, index, _HALF), ir.VectorType(_WORD, CHANNELS)
+        )
+        return self._builder.bitcast(
+            self._builder.shl(bits, _constant(16, _WORD)), ir.VectorType(_FLOAT, CHANNELS)
+        )
+
+    def store_numbers(self, value: Any, array: Any, number: int, index: Any) -> None:
+        """Store float32 in an array of float32 or, rounded to even, of the bits of bfloat16."""
+        if self._types[number].dtype == types.float32:
+            self.store(value, array, number, index)
+            return
+        builder = self._builder
+        bits = builder.bitcast(value, ir.VectorType(_WORD, CHANNELS))
+        upper = builder.lshr(bits, _constant(16, _WORD))
+        odd = builder.and_(upper, _constant(1, _WORD))
+        up = builder.add(builder.add(bits, odd), _constant(0x7FFF, _WORD))
+        rounded = builder.lshr(up, _constant(16, _WORD))
+        unordered = builder.fcmp_unordered("uno", value, value)
+        rounded = builder.select(unordered, _constant(_QUIET_NAN, _WORD), rounded)
+        self.store(builder.trunc(rounded, ir.VectorType(_HALF, CHANNELS)), array, number, index)
 
     def _pointer(self, array: Any, number: int, index: Any, vector: Any) -> Any:
         data = self._context.make_array(self._types[number])(
@@ -124,7 +155,7 @@ def _pool(typing: Any, lines: Any, at: Any, step: Any, pooled: Any, largest: Any
             best = builder.select(larger, value, best)
             which = builder.select(larger, _constant(i, _BYTE), which)
         negative = builder.fcmp_ordered("<", best, _constant(0.0))
-        lanes.store(builder.select(negative, _constant(0.0), best), pooled, 3, out)
+        lanes.store_numbers(builder.select(negative, _constant(0.0), best), pooled, 3, out)
         lanes.store(which, largest, 4, out)
         return context.get_dummy_value()
 
@@ -141,8 +172,8 @@ def _unpool(
     def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _Lanes(context, builder, signature)
         gradient, pooled, largest, out, lines, at, step, bias = arguments
-        positive = builder.fcmp_ordered(">", lanes.load(pooled, 1, out), _constant(0.0))
-        passed = builder.select(positive, lanes.load(gradient, 0, out), _constant(0.0))
+        positive = builder.fcmp_ordered(">", lanes.load_numbers(pooled, 1, out), _constant(0.0))
+        passed = builder.select(positive, lanes.load_numbers(gradient, 0, out), _constant(0.0))
         which, zero = lanes.load(largest, 2, out, _BYTE), ir.Constant(at.type, 0)
         for i, offset in enumerate(_offsets(builder, step)):
             its = builder.icmp_unsigned("==", which, _constant(i, _BYTE))

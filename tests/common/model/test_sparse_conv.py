@@ -66,6 +66,25 @@ def test_values_and_gradients_are_those_of_torch(
         torch.testing.assert_close(gradient.double(), exact.double(), atol=limit, rtol=0)
 
 
+@settings(max_examples=20, deadline=None)
+@given(nonzero=st.floats(0.0, 0.2), seed=st.integers(0, 2**16))
+def test_bfloat16_outputs_are_the_float32_ones_rounded_once(nonzero: float, seed: int) -> None:
+    states, (weight, bias) = images(3, 4, 60, nonzero, seed), parameters(4, seed)
+    listed = nonzero_pixels(states)
+    assert listed is not None
+    exact = first_layer(listed, weight, bias)
+    found = first_layer(listed, weight, bias, torch.bfloat16)
+    assert torch.equal(found, exact.to(torch.bfloat16))
+    wanted = torch.randn(exact.shape, generator=torch.Generator().manual_seed(seed))
+    wanted = wanted.to(torch.bfloat16)
+    for layout in (torch.contiguous_format, torch.channels_last):
+        gradient_in = wanted.contiguous(memory_format=layout)
+        got = torch.autograd.grad(found, (weight, bias), gradient_in, retain_graph=True)
+        due = torch.autograd.grad(exact, (weight, bias), gradient_in.float(), retain_graph=True)
+        for gradient, expected in zip(got, due, strict=True):
+            assert torch.equal(gradient, expected)
+
+
 def test_without_gradients_the_values_are_the_same_to_the_bit() -> None:
     states, (weight, bias) = images(3, 4, 60, 0.1), parameters(4)
     with torch.no_grad():
@@ -112,7 +131,11 @@ def test_black_images_give_the_bias_and_only_it_learns() -> None:
 def test_what_is_not_a_number_is_not_swallowed(where: str) -> None:
     """A learner stops at such values, so that it hands none on."""
     states, (weight, bias) = images(1, 4, 60, 0.2), parameters(4)
+    listed = nonzero_pixels(states)
+    assert listed is not None
     with torch.no_grad():
         (weight if where == "weight" else bias)[3] = torch.nan
-        assert bool(ours(states, weight, bias)[:, 3].isnan().any())
-        assert not bool(ours(states, weight, bias)[:, 4].isnan().any())
+        for dtype in (torch.float32, torch.bfloat16):
+            outputs = first_layer(listed, weight, bias, dtype)
+            assert bool(outputs[:, 3].isnan().any())
+            assert not bool(outputs[:, 4].isnan().any())
