@@ -56,6 +56,11 @@ COMMANDS = {
     ),
     "runs": Command("services.tools.runs", "show the runs in a folder: state, success, disk"),
     "runs rm": Command("services.tools.runs_rm", "remove runs, after asking"),
+    "demo": Command(
+        "services.tools.demo.main",
+        "watch pretrained robots play, and move what is in their way",
+        "services.tools.flags:demo",
+    ),
     "evaluate": Command(
         "services.tools.evaluate",
         "run the paper's test on weights or a controller",

@@ -1,7 +1,7 @@
 """Runs by name: the folder that they are kept in, and the run that a word means.
 
-A word is a run's name in that folder, a path, or `latest`: the run that was active last. Nothing
-is written.
+A word is a run's name in that folder, a path, or `latest`: the run that was active last. Where
+weights are asked for, it may also name pretrained ones. Nothing is written.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from mrcdrl.common.errors import ConfigError, RunDirectoryError
 from mrcdrl.common.runtime.completion import completed_by
 from mrcdrl.common.runtime.files import METRICS, RUN_CONFIG, WEIGHTS_SUFFIX
 from mrcdrl.common.runtime.names import check_name
+from mrcdrl.common.runtime.pretrained import PREFIX, pretrained_names, pretrained_path
 
 RUN_DIR_VARIABLE = "MRCDRL_RUN_DIR"
 LATEST = "latest"
@@ -91,13 +92,18 @@ def find_run(word: str | None, given: Path | None = None) -> Path:
 def find_weights(word: str, given: Path | None = None) -> Path:
     """The directory of a run, another directory, or a file of weights, which may be missing.
 
-    Arguments and errors are those of `find_run`.
+    `pretrained:NAME` means weights that come with the package; so does NAME alone where no run and
+    no file is called so. Arguments and errors are those of `find_run`.
     """
+    if word.startswith(PREFIX):
+        return pretrained_path(word.removeprefix(PREFIX))
     named = runs_folder(given) / word
     if word == LATEST or (not _is_path(word) and is_run(named)):
         return run_path(word, given)
     path = Path(word)
     if not (path.exists() or path.suffix == WEIGHTS_SUFFIX):
+        if word in pretrained_names():
+            return pretrained_path(word)
         raise RunDirectoryError(unknown_run(path if _is_path(word) else named))
     return path
 
@@ -129,6 +135,11 @@ def run_names(_typed: str = "") -> list[str]:
     """Words that name a run here, as a shell completes them."""
     names = [run.name for run in run_paths(runs_folder())]
     return [*names, LATEST] if names else []
+
+
+def weights_names(typed: str = "") -> list[str]:
+    """Words that name weights here, as a shell completes them."""
+    return [*run_names(typed), *(PREFIX + name for name in pretrained_names())]
 
 
 def active_s(run: Path) -> float:

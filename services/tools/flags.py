@@ -13,7 +13,9 @@ from mrcdrl.common.config.arguments import (
     whole_number,
 )
 from mrcdrl.common.runtime.completion import completed_by
-from mrcdrl.common.runtime.runs import LATEST, add_run, add_run_dir, run_names
+from mrcdrl.common.runtime.pretrained import PREFIX
+from mrcdrl.common.runtime.runs import LATEST, add_run, add_run_dir, weights_names
+from mrcdrl.services.web.flags import add_serving
 
 CONTROLLERS = ("random", "greedy", "potential_field", "orca", "safe_circle")
 FIGURES = ("arena", "views", "trajectories", "comparison", "curves")
@@ -23,7 +25,7 @@ _SHOWN = (  # in the short help
     "arena.num_obstacles",
     "evaluator.epsilon",
 )
-_ONE_SUBJECT = f"a run (its name, its path, or {LATEST}) or a .safetensors file"
+_ONE_SUBJECT = f"a run (its name, its path, or {LATEST}), a .safetensors file, or {PREFIX}NAME"
 _FIGURE = """Plot the paper's figures of any run, weights or controller.
 
 arena         Fig. 1: a start
@@ -64,6 +66,20 @@ def render() -> Parser:
     return made
 
 
+def demo() -> Parser:
+    """The flags of `mrcdrl demo`."""
+    text = "Watch a policy play, live in a browser; move its robots and targets."
+    made = Parser(prog="mrcdrl demo", description=text)
+    _add_weights(made, "?", f"{_ONE_SUBJECT}; default: pretrained ones that suit --robots")
+    made.set_defaults(controller=None)
+    _add_seed(made)
+    add_run_dir(made)
+    add_config_flag(made, of_run=True)
+    add_serving(made)
+    add_config_flags(made, _SHOWN)
+    return made
+
+
 def report() -> Parser:
     """The flags of `mrcdrl report`."""
     made = Parser(prog="mrcdrl report", description="Write the plots and the film of a run.")
@@ -75,7 +91,7 @@ def figure() -> Parser:
     """The flags of `mrcdrl figure`."""
     made = Parser(prog="mrcdrl figure", description=_FIGURE)
     made.add_argument("figure", metavar="FIGURE", choices=FIGURES, help=", ".join(FIGURES))
-    _add_weights(made, "*", f"runs (name, path, or {LATEST}) or .safetensors files")
+    _add_weights(made, "*", f"runs (name, path, or {LATEST}), .safetensors files, or {PREFIX}NAME")
     _add_controller(made, "besides weights, or instead: ", "append", [])
     _add_episodes(made, "to show; default: 12, or 4 to compare", None)
     made.add_argument(
@@ -117,7 +133,7 @@ def _one_subject(command: str, description: str) -> Parser:
 
 
 def _add_weights(made: Parser, nargs: str | None, text: str) -> None:
-    completed_by(made.add_argument("weights", nargs=nargs, help=text), run_names)
+    completed_by(made.add_argument("weights", nargs=nargs, help=text), weights_names)
 
 
 def _add_controller(made: Parser, text: str, action: str, default: list[str] | None = None) -> None:
@@ -136,6 +152,10 @@ def _add_episodes(made: Parser, text: str, default: int | None) -> None:
     made.add_argument(
         "--episodes", metavar="N", type=whole_number(1), default=default, help=f"episodes {text}"
     )
+    _add_seed(made)
+
+
+def _add_seed(made: Parser) -> None:
     made.add_argument(
         "--seed",
         metavar="N",

@@ -56,6 +56,18 @@ class Subject:
         """The subject with each number of robots alone, in rising order."""
         return [self._playing(config) for config in self.config.each_number()]
 
+    def with_robots(self, number: int) -> Self:
+        """The subject with this number of robots; raises ConfigError if the arena is for others."""
+        arena = self.config.arena
+        if arena.targets_px and len(arena.targets_px) < number:
+            raise ConfigError(
+                f"arena.targets_px has {len(arena.targets_px)} targets, too few for {number} robots"
+            )
+        if arena.num_targets < number:
+            arena = arena.model_copy(update={"num_targets": 0})  # as many as there are robots
+        update = {"arena": arena.with_robots(number)}
+        return self._playing(self.config.model_copy(update=update))
+
     def _playing(self, config: Config) -> Self:
         policy = self.policy and self.policy.averaging(averaged_symmetries(config))
         return replace(self, config=config, policy=policy)
@@ -112,12 +124,18 @@ def _known(config: Config) -> Config:
     return config if config.arena.num_actions else looked_up(config)
 
 
+def trained_with(own: str) -> tuple[int, ...]:
+    """The numbers of robots that weights were trained with; own: their run's configuration file.
+
+    Empty if they are of no run.
+    """
+    return () if own == DEFAULT_PRESET else load_config(own, environ={}).arena.numbers
+
+
 def _say_other_robots(path: Path, own: str, config: Config) -> None:
     """Say so if the weights were trained with another number of robots; own: their run's file."""
-    if own == DEFAULT_PRESET:
-        return  # they are of no run
-    learned, now = load_config(own, environ={}).arena.numbers, config.arena.numbers
-    if not set(now) <= set(learned):
+    learned, now = trained_with(own), config.arena.numbers
+    if learned and not set(now) <= set(learned):
         told = (", ".join(map(str, numbers)) for numbers in (learned, now))
         _LOG.warning("%s: trained with %s robots, plays with %s", path, *told)
 

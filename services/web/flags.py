@@ -28,6 +28,20 @@ def parser() -> Parser:
     )
     completed_by(shown, run_names)
     add_run_dir(made)
+    add_serving(made)
+    made.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        action="append",
+        help="of runs that note none here, such as tcp/HOST:7447",
+    )
+    add_transport_flag(made)
+    add_config_flags(made, only=("transport",))
+    return made
+
+
+def add_serving(made: Parser) -> None:
+    """Add the flags that say where a page is served, and who may read it."""
     made.add_argument(
         "--host",
         metavar="HOST",
@@ -58,15 +72,6 @@ def parser() -> Parser:
         ("client-ca", "authority of browsers' certificates, instead of a token"),
     ):
         made.add_argument(f"--https-{flag}", metavar="FILE", type=Path, help=text)
-    made.add_argument(
-        "--connect",
-        metavar="ENDPOINT",
-        action="append",
-        help="of runs that note none here, such as tcp/HOST:7447",
-    )
-    add_transport_flag(made)
-    add_config_flags(made, only=("transport",))
-    return made
 
 
 def page_address(host: str, port: int, path: str, *, secure: bool = False) -> str:

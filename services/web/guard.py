@@ -1,14 +1,14 @@
 """What every request has to pass, and every answer says, before and after the pages themselves.
 
-Invariants: only GET and HEAD reach a page; a request for another host, or from another site, does
-not; where there is a token, nothing is told to who does not have it. No answer allows another site
-to read it.
+Invariants: only GET and HEAD reach a page, and POST from the page itself where something can be
+changed; a request for another host, or from another site, does not; where there is a token, nothing
+is told to who does not have it. No answer allows another site to read it.
 """
 
 import hmac
 import ipaddress
 import socket
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qsl, urlencode
 
@@ -45,11 +45,15 @@ _WEEK_S = 7 * 86_400
 class Guard:
     """The outermost application: checks each request, and adds headers to each answer."""
 
-    def __init__(self, app: ASGIApp, hosts: Iterable[str], token: str | None) -> None:
+    def __init__(
+        self, app: ASGIApp, hosts: Iterable[str], token: str | None, changes: Collection[str] = ()
+    ) -> None:
         """hosts: names by which this server is reached besides its addresses and `localhost`.
 
-        token: asked for if there is one, once in the address and then by a cookie.
+        token: asked for if there is one, once in the address and then by a cookie. changes: paths
+        that take POST, with JSON only: a form of another site cannot send that.
         """
+        self._changes = frozenset(changes)
         self._app = app
         self._hosts = frozenset({"localhost", socket.gethostname().lower(), *hosts})
         self._token = token
@@ -75,8 +79,12 @@ class Guard:
         headers = Headers(scope=scope)
         if not self._is_this_host(headers.get("host", "")):
             return _said(421, "this address is not one of this server's")
-        if scope["method"] not in ("GET", "HEAD"):
-            return _said(405, "this server only shows", {"Allow": "GET, HEAD"})
+        changes = scope["path"] in self._changes
+        if scope["method"] not in (("POST",) if changes else ("GET", "HEAD")):
+            allowed = "POST" if changes else "GET, HEAD"
+            return _said(405, f"only {allowed}", {"Allow": allowed})
+        if changes and headers.get("content-type") != "application/json":
+            return _said(415, "send application/json")
         elsewhere = headers.get("sec-fetch-site") == "cross-site"
         if elsewhere and headers.get("sec-fetch-mode") != "navigate":
             return _said(403, "another site may not read this one")

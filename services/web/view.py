@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mrcdrl.common.config import Config, differences, load_config, nearest_preset
+from mrcdrl.common.config import ArenaConfig, Config, differences, load_config, nearest_preset
 from mrcdrl.common.config.returns import largest_return
 from mrcdrl.common.config.settings import all_settings
 from mrcdrl.common.config.toml import toml_value
@@ -105,7 +105,7 @@ def settings_view(config: Config) -> dict[str, Any]:
     return {
         "preset": preset,
         "largest_return": largest_return(config),
-        "arena": _arena(config),
+        "arena": arena_view(config.arena),
         "settings": [
             {
                 "key": setting.key,
@@ -118,9 +118,8 @@ def settings_view(config: Config) -> dict[str, Any]:
     }
 
 
-def _arena(config: Config) -> dict[str, Any]:
+def arena_view(arena: ArenaConfig) -> dict[str, Any]:
     """What it takes to draw the arena; lengths in px."""
-    arena = config.arena
     return {
         "size": arena.size_px,
         "robot_radius": arena.robot_radius_px,

@@ -19,6 +19,7 @@ export class ArenaView {
     this.drawn = null;
     this.said = "";
     this.times = []; // of the frames that came, in ms
+    this.held = null; // what is about to be moved: {thing, index}
     byId("play").addEventListener("click", () => this.#play(!this.playing));
     byId("back").addEventListener("click", () => this.#step(-1));
     byId("forward").addEventListener("click", () => this.#step(1));
@@ -55,6 +56,23 @@ export class ArenaView {
     }
     frame.pixels = frame.images ? await inflated(frame.images) : null;
     this.drawn = null;
+  }
+
+  // A place on the canvas, in px of the arena.
+  placeOf(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const scale = this.arena.size / box.width;
+    return [(event.clientX - box.left) * scale, (event.clientY - box.top) * scale];
+  }
+
+  // The robot or target at a place of the frame shown; null if there is none.
+  thingAt([x, y]) {
+    if (!this.drawn) return null;
+    const near = (list, reach) => list.findIndex(([a, b]) => Math.hypot(a - x, b - y) <= reach);
+    const robot = near(this.drawn.robots, this.arena.robot_radius);
+    if (robot >= 0) return { thing: "robot", index: robot };
+    const target = near(this.drawn.targets, Math.max(this.arena.target_size, 22));
+    return target >= 0 ? { thing: "target", index: target } : null;
   }
 
   // Frames that came in the last second.
@@ -131,6 +149,14 @@ export class ArenaView {
       c.textBaseline = "middle";
       c.fillText(String(robot + 1), x - 0.35 * radius * Math.cos(heading), y - 0.35 * radius * Math.sin(heading));
     });
+    const held = this.held && frame[`${this.held.thing}s`][this.held.index];
+    if (held) {
+      c.strokeStyle = "#ffd54a";
+      c.lineWidth = 3;
+      c.beginPath();
+      c.arc(held[0], held[1], arena.robot_radius + 9, 0, 2 * Math.PI);
+      c.stroke();
+    }
     if (frame.outcome) {
       c.strokeStyle = frame.outcome === "success" ? "#35d07a" : "#ff3b30";
       c.lineWidth = 12;

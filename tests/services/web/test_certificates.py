@@ -11,8 +11,8 @@ from mrcdrl.common.messages.trajectory import Stats
 from mrcdrl.common.messages.wire import encode
 from mrcdrl.common.transport import Session, free_endpoint
 from mrcdrl.common.transport.keys import Keys
+from mrcdrl.services.web.access import _certificates, _token
 from mrcdrl.services.web.flags import parser
-from mrcdrl.services.web.main import _certificates, _token
 from mrcdrl.services.web.server import Certificates
 from tests.patience import PATIENCE_S, eventually
 from tests.services.web.web_server import record_run, served

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from mrcdrl.common.config import load_config
+from mrcdrl.services.web.access import _token
 from mrcdrl.services.web.flags import parser
-from mrcdrl.services.web.main import _token
 from tests.services.web.web_server import Served, record_run, served
 
 SECRET = "correct horse"

@@ -5,11 +5,13 @@ import http.client
 import json
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from starlette.types import ASGIApp
 
 from mrcdrl.common.config import Config, TransportConfig, to_toml
 from mrcdrl.common.messages.trajectory import EpisodeSummary, Evaluation, Outcome, Stats
@@ -33,17 +35,24 @@ class Served:
     runs: Runs
 
     def get(
-        self, path: str, method: str = "GET", **headers: str
+        self, path: str, method: str = "GET", body: bytes | None = None, **headers: str
     ) -> tuple[int, dict[str, str], bytes]:
         """Status, headers and body of an answer; header names with `_` for `-`."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         try:
-            connection.request(method, path, headers=given)
+            connection.request(method, path, body, given)
             answer = connection.getresponse()
             return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
         finally:
             connection.close()
+
+    def post(
+        self, path: str, change: object, content_type: str = "application/json", **headers: str
+    ) -> tuple[int, dict[str, str], bytes]:
+        """The same for a POST of text as it is, or of a value as JSON."""
+        text = change if isinstance(change, str) else json.dumps(change)
+        return self.get(path, "POST", text.encode(), Content_Type=content_type, **headers)
 
     def json(self, path: str) -> Any:
         """The value in an answer that has to be there."""
@@ -65,22 +74,36 @@ def served(
     port: int = 0,
 ) -> Iterator[Served]:
     """Serve a folder of runs in a thread of its own."""
-    stop, listener = StopSignal(), listen("127.0.0.1", port, 0)
     runs = Runs(transport or TransportConfig())
     found = RunFolder(folder)
     app = Guard(make_app(found, runs, routes=[metrics_route(found, runs)]), [], token)
+    with serving(app, runs.tend, runs.close, certificates, port, runs) as up:
+        yield up
+
+
+@contextmanager
+def serving(
+    app: ASGIApp,
+    each_second: Callable[[], None],
+    end: Callable[[], Awaitable[None]],
+    certificates: Certificates | None = None,
+    port: int = 0,
+    runs: Runs | None = None,
+) -> Iterator[Served]:
+    """Serve an application in a thread of its own."""
+    stop, listener = StopSignal(), listen("127.0.0.1", port, 0)
     failed: list[BaseException] = []
 
     def answer() -> None:
         try:
-            asyncio.run(serve(app, listener, certificates, stop, runs.tend, runs.close))
+            asyncio.run(serve(app, listener, certificates, stop, each_second, end))
         except BaseException as error:  # noqa: BLE001, raised below
             failed.append(error)
 
     thread = threading.Thread(target=answer)
     thread.start()
     try:
-        yield Served(listener.getsockname()[1], runs)
+        yield Served(listener.getsockname()[1], runs or Runs(TransportConfig()))
     finally:
         stop.set()
         thread.join(PATIENCE_S)
