@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import arena, learner, renderer_error
+from benchmarks import arena, learner, renderer_error, summary
 
 
 @pytest.fixture(autouse=True)
@@ -104,3 +104,38 @@ def test_renderer_error_knows_every_size_and_orientation(
         above = f"{error['orientation']} {error['crop_px']:g}" in result["above_limit"]
         assert above == (error["mean_abs"] > 0.5)
     assert image.stat().st_size > 10_000
+
+
+def test_the_page_of_benchmarks_is_made_of_the_raw_lines() -> None:
+    page = (summary.PAGE).read_text("utf-8")
+    assert page == summary.text(summary.Lines()), "run: python -m benchmarks.summary"
+    for table in summary.TABLES:
+        assert f"## {table.title}" in page
+
+
+def test_lines_measured_here_stand_before_the_committed_ones(tmp_path: Path) -> None:
+    (found,) = summary.Lines()("arena/arena.jsonl")
+    rates = {name: {"median": 1000.0} for name in found["rates"]}
+    here = tmp_path / "arena" / "arena.jsonl"
+    here.parent.mkdir()
+    line = {**found, "rates": rates, "machine": {"cpu": "Abacus", "cores": 3}}
+    here.write_text(json.dumps(line) + "\n")
+    lines = summary.Lines(tmp_path)
+    assert lines("arena/arena.jsonl")[0]["machine"]["cpu"] == "Abacus"
+    assert {row.times for row in summary.arena(lines)} == {1.0}
+    assert "3 cores of Abacus" in summary.text(lines)
+    assert summary.replay(lines) == summary.replay(summary.Lines())
+
+
+def test_where_a_peer_is_better_it_is_said(tmp_path: Path) -> None:
+    page = summary.text(summary.Lines())
+    worse = [
+        row
+        for table in summary.TABLES
+        for row in table.rows(summary.Lines())
+        if row.times is not None and row.times < 1
+    ]
+    assert worse
+    said = next(part for part in page.split("\n\n") if part.startswith("A peer is better in"))
+    assert all(row.what in said for row in worse)
+    assert all(f"**{row.times:.2f}**" in page for row in worse)
