@@ -14,7 +14,10 @@ ARG PIP_EXTRA_INDEX_URL
 ENV PIP_CONSTRAINT=/src/constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 WORKDIR /src
 RUN python -m venv --without-pip /opt/mrcdrl
+# What writes an image's bill of materials: CycloneDX, the packages with versions and licences.
+ENV SBOM="/opt/sbom/bin/cyclonedx-py environment --output-reproducible --output-file /opt/mrcdrl/sbom.cdx.json /opt/mrcdrl/bin/python"
 COPY pyproject.toml constraints.txt README.md LICENSE ./
+RUN python -m venv --without-pip /opt/sbom && pip --python /opt/sbom/bin/python install cyclonedx-bom
 
 # Leaves out tests, highlighting of other languages, and byte code that no service reads.
 FROM installer AS small-installed
@@ -31,14 +34,17 @@ COPY configs configs
 COPY mrcdrl mrcdrl
 RUN pip --python /opt/mrcdrl/bin/python install --no-compile --no-deps --force-reinstall . \
  && /opt/mrcdrl/bin/python -c "import mrcdrl.cli, mrcdrl.common.runtime.heartbeat, mrcdrl.services.replay.main, \
-      mrcdrl.services.replay.inspect.main, mrcdrl.services.router.main, mrcdrl.services.status.main"
+      mrcdrl.services.replay.inspect.main, mrcdrl.services.router.main, mrcdrl.services.status.main" \
+ && $SBOM
 
 FROM small-installed AS web-installed
 RUN pip --python /opt/mrcdrl/bin/python install --no-compile starlette uvicorn sse-starlette \
- && /opt/mrcdrl/bin/python -c "import mrcdrl.services.web.main"
+ && /opt/mrcdrl/bin/python -c "import mrcdrl.services.web.main" \
+ && $SBOM
 
 FROM small-installed AS certs-installed
-RUN pip --python /opt/mrcdrl/bin/python install cryptography
+RUN pip --python /opt/mrcdrl/bin/python install cryptography \
+ && $SBOM
 
 FROM installer AS learning-installed
 # Where PyTorch comes from: its own index of builds for CPUs, or with "" pip's index, which also serves
@@ -54,8 +60,10 @@ RUN pip --python /opt/mrcdrl/bin/python install '.[arena,learn]'
 COPY common common
 COPY services services
 COPY configs configs
+COPY pretrained pretrained
 COPY mrcdrl mrcdrl
-RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall .
+RUN pip --python /opt/mrcdrl/bin/python install --no-deps --force-reinstall . \
+ && $SBOM
 
 # -- common to all: an unprivileged user, a folder for runs, health by work done ---------------------
 

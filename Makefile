@@ -35,6 +35,7 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/codespell
 
 # The documentation as a site in build/docs; a warning fails it. The first call installs what it takes.
 docs: $(VENV)/docs-installed
@@ -48,12 +49,20 @@ format: install
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+# Measures what needs no peer, for some ten minutes, and writes the page of benchmarks to build/benchmarks.
 bench: install
-	for file in benchmarks/stages.py benchmarks/arena.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) $(ARGS) || exit 1; done
+	$(BIN)/python -m benchmarks.summary --measure build/benchmarks
 
-# The source archive, and the wheel built from it, in dist/.
+# The source archive, and the wheel built from it, in dist/: the same bytes wherever a commit is built.
+wheel: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct 2>/dev/null || echo 1577836800)
 wheel: install
-	$(BIN)/python -m build --no-isolation
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation --sdist --outdir dist/raw
+	mkdir dist/tree && tar --extract --gzip --file dist/raw/*.tar.gz --directory dist/tree
+	name=$$(basename dist/raw/*.tar.gz .tar.gz) && tar --create --directory dist/tree --sort=name --format=gnu \
+	  --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner --mode=u+rwX,go+rX,go-w $$name | gzip --no-name --best > dist/$$name.tar.gz
+	$(BIN)/python -m build --no-isolation --wheel --outdir dist dist/tree/*
+	rm -rf dist/raw dist/tree
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -4,6 +4,7 @@ There are two stacks, one after the other, and the tests of each run in order: a
 secured one with two shards. Without an engine the tests are skipped, and say so.
 """
 
+import ast
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -123,6 +124,18 @@ def test_it_imports_nothing_from_the_working_directory(stack: Stack, service: st
         *("run", "--rm", "--no-deps", "--no-TTY", "--entrypoint", "sh", service),
         *("-c", CROWDED, service),
     )
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_an_image_lists_what_is_in_it(stack: Stack, service: str) -> None:
+    (container,) = stack.containers(service)
+    bill = json.loads(stack.docker("exec", container.id, "cat", "/opt/mrcdrl/sbom.cdx.json"))
+    assert bill["bomFormat"] == "CycloneDX"
+    listed = {part["name"]: part["version"] for part in bill["components"]}
+    show = "import importlib.metadata as m; print({d.name: d.version for d in m.distributions()})"
+    installed = ast.literal_eval(stack.docker("exec", container.id, "python", "-c", show))
+    assert listed == installed
+    assert {"mrcdrl", "eclipse-zenoh"} <= set(listed)
 
 
 @pytest.mark.parametrize("service", SERVICES)

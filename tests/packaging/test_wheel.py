@@ -1,5 +1,6 @@
 """The wheel, installed outside the clone, holds `mrcdrl` alone and trains from any directory."""
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -18,7 +19,12 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).resolve().parents[2]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
-PACKAGES = ("common", "services", "configs")  # links of these names in mrcdrl/ lead to them
+PACKAGES = (
+    "common",
+    "services",
+    "configs",
+    "pretrained",
+)  # links of these names in mrcdrl/ lead to them
 FOLDERS = (*PACKAGES, "mrcdrl", "tests", "docs", "examples", "experiments")
 FILES = (
     *("pyproject.toml", "MANIFEST.in", "constraints.txt", "Makefile"),
@@ -124,6 +130,26 @@ def test_the_wheel_of_the_sdist_is_the_wheel_of_the_tree(
     (direct,) = (tree / "direct").iterdir()
     assert direct.name == built[1].name
     assert contents(direct) == contents(built[1])
+
+
+def test_a_release_has_the_same_bytes_wherever_it_is_built(
+    tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    digests = []
+    for place in ("here", "else/where"):
+        copy = tmp_path / place
+        ignore = shutil.ignore_patterns("dist", "direct", "build", "*.egg-info")
+        shutil.copytree(tree, copy, symlinks=True, ignore=ignore)
+        for path in copy.rglob("*"):
+            if path.is_file():
+                path.touch()  # of another time
+        # -o: what is installed here is what builds
+        run("make", "-o", "install", f"BIN={Path(sys.executable).parent}", "wheel", cwd=copy)
+        files = sorted((copy / "dist").iterdir())
+        assert [file.suffix for file in files] == [".whl", ".gz"]
+        digests.append([hashlib.sha256(file.read_bytes()).hexdigest() for file in files])
+    assert digests[0] == digests[1]
 
 
 def test_the_sdist_holds_tests_docs_grids_and_licence(built: tuple[Path, Path]) -> None:
