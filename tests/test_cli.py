@@ -126,7 +126,7 @@ def test_a_short_flag_means_the_same_in_every_command() -> None:
 def test_what_a_program_would_want_comes_as_json() -> None:
     """Services have no result, pictures are one, and `simulate` always prints JSON."""
     without = {"replay", "router", "actor", "learner", "evaluator", "completion", "simulate"}
-    without |= {"web"}
+    without |= {"web", "demo"}
     without |= {"render", "figure", "report", "runs rm"}
     for name, parser in parsers().items():
         flags = {word for action in parser._actions for word in action.option_strings}

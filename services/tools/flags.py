@@ -25,7 +25,7 @@ _SHOWN = (  # in the short help
     "arena.num_obstacles",
     "evaluator.epsilon",
 )
-_ONE_SUBJECT = f"a run (its name, its path, or {LATEST}), a .safetensors file, or {PREFIX}NAME"
+_ONE_SUBJECT = f"a run (name, path, or {LATEST}), a .safetensors file, or {PREFIX}NAME"
 _FIGURE = """Plot the paper's figures of any run, weights or controller.
 
 arena         Fig. 1: a start
@@ -70,7 +70,7 @@ def demo() -> Parser:
     """The flags of `mrcdrl demo`."""
     text = "Watch a policy play, live in a browser; move its robots and targets."
     made = Parser(prog="mrcdrl demo", description=text)
-    _add_weights(made, "?", f"{_ONE_SUBJECT}; default: pretrained ones that suit --robots")
+    _add_weights(made, "?", f"{_ONE_SUBJECT}; default: as suits --robots")
     made.set_defaults(controller=None)
     _add_seed(made)
     add_run_dir(made)
@@ -91,7 +91,7 @@ def figure() -> Parser:
     """The flags of `mrcdrl figure`."""
     made = Parser(prog="mrcdrl figure", description=_FIGURE)
     made.add_argument("figure", metavar="FIGURE", choices=FIGURES, help=", ".join(FIGURES))
-    _add_weights(made, "*", f"runs (name, path, or {LATEST}), .safetensors files, or {PREFIX}NAME")
+    _add_weights(made, "*", f"runs, .safetensors files, or {PREFIX}NAME")
     _add_controller(made, "besides weights, or instead: ", "append", [])
     _add_episodes(made, "to show; default: 12, or 4 to compare", None)
     made.add_argument(

@@ -91,7 +91,8 @@ class Stack:
 
     def __init__(self, environment: Mapping[str, str], *overrides: Path) -> None:
         self.project = f"mrcdrl-test-{uuid.uuid4().hex[:8]}"
-        self._environment = dict(environment)
+        # The page at any free port: others may have one here.
+        self._environment = {**environment, "WEB_PORT": "0"}
         self._head = ["docker", "compose", "--project-name", self.project]
         self._head += [word for file in (BASE, *overrides) for word in ("--file", str(file))]
 
