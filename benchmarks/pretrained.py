@@ -8,7 +8,7 @@ find them. The starts are others than those by which the run chose its best weig
 
 import argparse
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from mrcdrl.common.config import load_config, to_toml
@@ -44,18 +44,13 @@ def main() -> None:
         with Progress() as progress:
             done = progress.stage("episodes", arguments.episodes)
             result, measures, _ = evaluate(subject, arguments.episodes, arguments.seed, done)
-        tests.append({**as_json(result), "navigation": as_json(measures)})
+        tests.append({**asdict(result), "navigation": measures and asdict(measures)})
     numbers = config.arena.numbers
     name = arguments.name or f"{numbers[-1]}robots"
     manifest = {"run": path.parent.name, "success_rate": [t["success_rate"] for t in tests]}
     text = card(name, numbers, saved.learner_step, tests, arguments.note)
     keep(ROOT / "pretrained" / name, saved, to_toml(config), manifest, text)
     print(json.dumps({"name": name, "success_rates": manifest["success_rate"]}))
-
-
-def as_json(found: object) -> dict:
-    """The fields of a result."""
-    return {name: getattr(found, name) for name in found.__dataclass_fields__}
 
 
 def card(name: str, numbers: tuple[int, ...], step: int, tests: list[dict], note: str) -> str:

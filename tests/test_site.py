@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, expect
 
 from tests.patience import PATIENCE_S
-from tests.services.web.watched import AXE, PATIENCE_MS
+from tests.services.web.watched import PATIENCE_MS, violations
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "build" / "docs"
@@ -41,12 +41,7 @@ def reader(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Browser
 def test_everybody_can_read_it(reader: BrowserContext, name: str) -> None:
     page = reader.new_page()
     page.goto((SITE / f"{name}.html").as_uri())
-    page.evaluate(AXE.read_text("utf-8"))
-    found = page.evaluate("axe.run()")
-    violations = [
-        f"{v['id']}: {node['html'][:200]}" for v in found["violations"] for node in v["nodes"]
-    ]
-    assert violations == []
+    assert violations(page) == []
 
 
 def test_it_can_be_searched_without_a_network(reader: BrowserContext) -> None:

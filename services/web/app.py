@@ -46,8 +46,8 @@ STATIC = Path(str(resources.files("mrcdrl.services.web") / "static"))
 MAX_PAGES = 64  # that are live at a time
 MAX_EVALUATIONS = 5000
 _READERS = 4  # threads that read records
-_SEND_S = 10.0  # a viewer that takes nothing for this long is disconnected
-_PING_S = 15
+SEND_S = 10.0  # a viewer that takes nothing for this long is disconnected
+PING_S = 15
 
 
 class Pages:
@@ -149,7 +149,7 @@ class Pages:
         if (role and role not in WATCHED) or (worker and not (role and is_name(worker))):
             raise HTTPException(400, "role is actor or evaluator, and worker its name")
         events = self._events(run_dir, (role, worker) if role else None)
-        return EventSourceResponse(events, ping=_PING_S, send_timeout=_SEND_S)
+        return EventSourceResponse(events, ping=PING_S, send_timeout=SEND_S)
 
     async def _events(
         self, run_dir: Path, worker: tuple[str, str] | None
@@ -206,7 +206,7 @@ def _stretch(query: Mapping[str, str]) -> tuple[int, float, float]:
     return num, begin_s, end_s
 
 
-async def _refused(_: Request, error: Exception) -> Response:
+async def refused(_: Request, error: Exception) -> Response:
     """An error as one line."""
     code = error.status_code if isinstance(error, HTTPException) else 500
     return PlainTextResponse(f"{getattr(error, 'detail', 'failed')}\n", code)
@@ -220,5 +220,5 @@ def make_app(
 
     return Starlette(
         routes=[*pages.routes(), *routes],
-        exception_handlers={HTTPException: _refused},
+        exception_handlers={HTTPException: refused},
     )

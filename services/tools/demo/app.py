@@ -11,26 +11,23 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 from sse_starlette import EventSourceResponse
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from mrcdrl.services.tools.demo.playground import Playground
-from mrcdrl.services.web.app import STATIC
+from mrcdrl.services.web.app import PING_S, SEND_S, STATIC, refused
 from mrcdrl.services.web.viewers import Viewer
 
 CHANGE = "/change"
 MAX_PAGES = 16
 _MAX_BYTES = 1000  # of a change
 _MOST = 1e6  # of a number in a change
-_PING_S = 15
-_SEND_S = 10.0  # a page that takes nothing for this long is disconnected
 
 
 class DemoPage:
@@ -48,8 +45,11 @@ class DemoPage:
             Route(CHANGE, self.change, methods=["POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
-        handlers: Any = {HTTPException: refused}
-        return Starlette(routes=routes, lifespan=self._lifespan, exception_handlers=handlers)
+        return Starlette(
+            routes=routes,
+            lifespan=self._lifespan,
+            exception_handlers={HTTPException: refused},
+        )
 
     def check(self) -> None:
         """Raise what ended the playing, if anything did."""
@@ -64,7 +64,7 @@ class DemoPage:
         """What is played, as it is played."""
         if len(self._playground.channel) >= MAX_PAGES:
             raise HTTPException(503, f"{MAX_PAGES} pages are open already")
-        return EventSourceResponse(self._events(), ping=_PING_S, send_timeout=_SEND_S)
+        return EventSourceResponse(self._events(), ping=PING_S, send_timeout=SEND_S)
 
     async def change(self, request: Request) -> Response:
         """Ask for a change; it is made before the next frame."""
@@ -107,9 +107,3 @@ def is_number(*values: object) -> bool:
     """Whether these are numbers that a change may have: finite, and not huge."""
     plain = (isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     return all(plain) and all(abs(v) < _MOST for v in values)  # type: ignore[arg-type]  # no NaN
-
-
-async def refused(_: Request, error: Exception) -> Response:
-    """An error as one line."""
-    code = error.status_code if isinstance(error, HTTPException) else 500
-    return PlainTextResponse(f"{getattr(error, 'detail', 'failed')}\n", code)

@@ -51,11 +51,10 @@ class Casting:
         self._named = arguments.weights is not None
         if self._named:
             self._cast = self._load(arguments.weights)
-            self.num_robots = self._cast.subject.config.arena.num_robots
         else:
             name = pretrained_for(int(asked) if asked and asked.isdecimal() else _USUAL_ROBOTS)
             self._cast = self._load(PREFIX + name)
-            self.num_robots = self._cast.subject.config.arena.num_robots
+        self.num_robots = self._cast.subject.config.arena.num_robots
 
     def __call__(self, num_robots: int) -> Cast:
         """The cast for this number of robots; raises MrcdrlError if there is none."""

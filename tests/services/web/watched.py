@@ -29,14 +29,19 @@ class Watched:
         self.said.append(text)
 
     def violations(self) -> list[str]:
-        """What axe-core finds, by all its rules for WCAG 2.2 A and AA and for good practice."""
-        self.page.evaluate(AXE.read_text("utf-8"))
-        found = self.page.evaluate("axe.run()")
-        return [
-            f"{v['id']}: {node['html'][:120]} ({node['failureSummary'][:200]})"
-            for v in found["violations"]
-            for node in v["nodes"]
-        ]
+        """Of the page, as `violations` finds them."""
+        return violations(self.page)
 
     def close(self) -> None:
         self._context.close()
+
+
+def violations(page: Page) -> list[str]:
+    """What axe-core finds, by all its rules for WCAG 2.2 A and AA and for good practice."""
+    page.evaluate(AXE.read_text("utf-8"))
+    found = page.evaluate("axe.run()")
+    return [
+        f"{v['id']}: {node['html'][:120]} ({node['failureSummary'][:200]})"
+        for v in found["violations"]
+        for node in v["nodes"]
+    ]
