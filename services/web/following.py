@@ -216,9 +216,6 @@ class FollowedRun:
                 chosen = {arena: _chosen(state, *arena) for arena in arenas}
                 frames.follow(worker for worker in chosen.values() if worker is not None)
                 follower.listen(0.0)
-                for worker, piece in frames.take(state):
-                    for arena in (a for a in arenas if chosen[a] == worker):
-                        self._in_loop(arenas[arena].publish, "frame", piece)
                 # Who is there is known a moment after joining; without it a state would mislead.
                 known = (
                     known or any(s.alive for s in state.services) or follower.lived_s >= _PERIOD_S
@@ -228,6 +225,9 @@ class FollowedRun:
                         return
                     due_s = follower.lived_s + _PERIOD_S
                     self._tell("state", live_view(state, follower.now))
+                for worker, piece in frames.take(state) if known else ():
+                    for arena in (a for a in arenas if chosen[a] == worker):
+                        self._in_loop(arenas[arena].publish, "frame", piece)
                 if known and not arenas:
                     pause_s = _TICK_S
                 else:

@@ -122,7 +122,7 @@ def test_no_other_key_can_be_subscribed_to(live: LiveRun, query: str) -> None:
 def test_a_viewer_that_takes_nothing_is_disconnected_and_holds_nobody(
     live: LiveRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(app, "_SEND_S", 0.5)
+    monkeypatch.setattr(app, "SEND_S", 0.5)
     big = "x" * 300_000
     monkeypatch.setattr(
         "mrcdrl.services.web.following.live_view", lambda _state, now: {"now": now, "pad": big}
