@@ -102,7 +102,7 @@ def whole_number(least: int, most: int = LARGEST) -> Callable[[str], int]:
 def add_transport_flag(parser: argparse.ArgumentParser) -> None:
     """Add the flag of a process that has settings of its own in [transport] only."""
     parser.add_argument(
-        "--transport", metavar="FILE", help="TOML file whose [transport] this process takes"
+        "--transport", metavar="FILE", help="TOML file whose [transport] this process uses"
     )
 
 

@@ -45,7 +45,7 @@ def parser() -> Parser:
         metavar="FILE",
         type=Path,
         default=ROUTER_FILE,
-        help="Zenoh's own; default: the installed router.json5",
+        help="Zenoh's settings; default: the installed router.json5",
     )
     made.add_argument(
         "--listen",
@@ -57,7 +57,7 @@ def parser() -> Parser:
         "--connect",
         metavar="ENDPOINT",
         action="append",
-        help="another router, linked to once it is up",
+        help="another router, to link to once it is up",
     )
     add_transport_flag(made)
     add_config_flags(made, only=("transport",))

@@ -147,7 +147,7 @@ def parser() -> Parser:
         "status", "Show what a live run does, and its bottleneck; without RUN, the latest."
     )
     made.add_argument("--watch", action="store_true", help="keep showing it until stopped")
-    made.add_argument("--json", action="store_true", help="as JSON, one object a line")
+    made.add_argument("--json", action="store_true", help="print JSON, one object a line")
     made.add_argument(
         "--record",
         action="store_true",

@@ -70,7 +70,7 @@ def demo() -> Parser:
     """The flags of `mrcdrl demo`."""
     text = "Watch a policy play, live in a browser; move its robots and targets."
     made = Parser(prog="mrcdrl demo", description=text)
-    _add_weights(made, "?", f"{_ONE_SUBJECT}; default: as suits --robots")
+    _add_weights(made, "?", f"{_ONE_SUBJECT}; default: to suit --robots")
     made.set_defaults(controller=None)
     _add_seed(made)
     add_run_dir(made)

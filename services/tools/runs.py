@@ -100,5 +100,5 @@ def parser() -> Parser:
     """The command's flags."""
     made = Parser(prog="mrcdrl runs", description="Show the runs in a folder.")
     add_run_dir(made)
-    made.add_argument("--json", action="store_true", help="as JSON, one object a line")
+    made.add_argument("--json", action="store_true", help="print JSON, one object a line")
     return made

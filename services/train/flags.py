@@ -25,26 +25,26 @@ def parser() -> Parser:
     made.add_argument(
         "name", nargs="?", default=argparse.SUPPRESS, metavar="NAME", help="the new run's name"
     )
-    made.add_argument("--name", help="the same; made of preset, robots and time by default")
+    made.add_argument("--name", help="the same; default: from preset, robots and time")
     resume = made.add_argument(
         "--resume", metavar="RUN", help=f"go on with this run: name, path or {LATEST}"
     )
     completed_by(resume, run_names)
     made.add_argument(
-        "--dry-run", action="store_true", help="say what the run would be and take, and end"
+        "--dry-run", action="store_true", help="print the plan, its time, memory and disk, and end"
     )
     made.add_argument("--json", action="store_true", help="print the summary as JSON at the end")
     made.add_argument(
         "--no-plots",
         action="store_false",
         dest="plots",
-        help="no plots and video at the end",
+        help="no plots or video at the end",
     )
     made.add_argument(
         "--no-web",
         action="store_false",
         dest="page",
-        help="start no page to watch the run by",
+        help="start no page for watching the run",
     )
     add_run_dir(made)
     add_config_flags(made, _SHOWN)

@@ -33,7 +33,7 @@ def parser() -> Parser:
         "--connect",
         metavar="ENDPOINT",
         action="append",
-        help="of runs that note none here, such as tcp/HOST:7447",
+        help="for runs that record none here, such as tcp/HOST:7447",
     )
     add_transport_flag(made)
     add_config_flags(made, only=("transport",))
@@ -57,7 +57,7 @@ def add_serving(made: Parser) -> None:
     made.add_argument(
         "--token",
         metavar="TEXT",
-        help=f"asked of browsers; also {TOKEN_VARIABLE}; made for other hosts",
+        help=f"required of browsers; also {TOKEN_VARIABLE}; generated for other hosts",
     )
     made.add_argument(
         "--name",

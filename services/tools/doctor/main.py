@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
 def parser() -> Parser:
     """Make the command's parser."""
     made = Parser(prog="mrcdrl doctor", description="Check this machine and a run.")
-    add_run(made, "also check this run, which is up")
+    add_run(made, "also check this live run")
     made.add_argument("--connect", action="append", help="its endpoint, such as tcp/HOST:7447")
     add_config_flag(made, of_run=True)
     made.add_argument("--json", action="store_true", help="print the findings as JSON")

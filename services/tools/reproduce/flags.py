@@ -18,7 +18,7 @@ def parser() -> Parser:
         metavar="PART",
         choices=choices,
         default=ALL,
-        help=f"{', '.join(choices)}: only what is there; default: {ALL}",
+        help=f"{', '.join(choices)} (trains nothing); default: {ALL}",
     )
     made.add_argument(
         "--scale",
