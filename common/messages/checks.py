@@ -17,7 +17,6 @@ from mrcdrl.common.config.schema import MOST_ACTIONS
 from mrcdrl.common.messages.metrics import SCHEMAS, DiagnosticMetrics, kinds
 from mrcdrl.common.messages.trajectory import (
     NO_SLOT,
-    NUM_ACTIONS,
     ArenaFrame,
     Chunk,
     EpisodeSummary,
@@ -266,8 +265,11 @@ def _check_arena_frame(frame: ArenaFrame) -> str | None:
         return f"{num_robots} robots"
     if num_acting not in (0, num_robots) or frame.actions.ndim != 1:
         return "actions is neither empty nor one for each robot"
-    if frame.q_values.shape != (num_acting, NUM_ACTIONS) or (frame.actions >= NUM_ACTIONS).any():
-        return f"q_values has not {NUM_ACTIONS} values for each action, or an action is none"
+    if frame.q_values.ndim != 2 or len(frame.q_values) != num_acting:
+        return "q_values is not a row for each action"
+    num_actions = frame.q_values.shape[1]
+    if not 2 <= num_actions <= MOST_ACTIONS or (frame.actions >= num_actions).any():
+        return f"q_values has not 2 to {MOST_ACTIONS} values for each action, or an action is none"
     if frame.collided.shape != (num_robots,):
         return "collided is not one for each robot"
     if frame.outcome and frame.outcome not in set(Outcome):

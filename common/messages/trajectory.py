@@ -277,7 +277,8 @@ class ArenaFrame:
     """One frame of an episode, for people to watch; K, M and O count what is there.
 
     The values, actions and images are those of the robots in this scene. The last frame of an
-    episode has an outcome, and neither values nor actions.
+    episode has an outcome, and neither values nor actions. In a custom world robots are its agents,
+    and stand at the origin.
     """
 
     role: str
@@ -290,7 +291,7 @@ class ArenaFrame:
     robots: Float32Array  # [K, 3], x px, y px, heading rad
     targets: Float32Array  # [M, 2], x px, y px
     obstacles: Float32Array  # [O, 3], x px, y px, radius px
-    q_values: Float32Array  # [K, NUM_ACTIONS], or [0, NUM_ACTIONS]
+    q_values: Float32Array  # [K, A], A actions, or [0, A]
     actions: UInt8Array  # [K], or [0]
     collided: UInt8Array  # [K], 1 if the move to this frame was undone
     outcome: str  # in the last frame, else empty

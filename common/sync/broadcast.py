@@ -80,7 +80,7 @@ class Broadcast(Closing):
         return self._publisher.watched or self._taken > 0
 
     def acts(self, moment: Moment, q_values: Float32Array, actions: UInt8Array) -> None:
-        """Take the frame before a step, the values [K, NUM_ACTIONS] and the actions chosen [K]."""
+        """Take the frame before a step, the values [K, A] and the actions chosen [K]."""
         if not self._publisher.watched:
             self._forget()
             return

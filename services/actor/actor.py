@@ -44,7 +44,7 @@ class Actor:
         lease: LeaseClient,
         broadcast: Broadcast | None = None,
     ) -> None:
-        """broadcast: is shown one of the arenas, while anybody watches; custom worlds are not."""
+        """broadcast: is shown one of the arenas, while anybody watches."""
         keys, worker = joining.keys, joining.worker
         self._config = config
         self._worker = worker
@@ -58,7 +58,7 @@ class Actor:
         self._policy = make_policy(
             config, resolve_device(config.actor.device, "actor.device"), averages=False
         )
-        self._broadcast = None if config.arena.is_custom else broadcast
+        self._broadcast = broadcast
         self._collector = make_collector(config, worker, self._policy, broadcast=self._broadcast)
         self._adopted_s = time.monotonic()
         self._epsilons = self._explore(lease.rank)

@@ -50,9 +50,8 @@ class Evaluator:
     ) -> None:
         """after_first: called once the first evaluation is published.
 
-        broadcast: is shown one of the arenas, while anybody watches; custom worlds are not.
+        broadcast: is shown one of the arenas, while anybody watches.
         """
-        broadcast = None if config.arena.is_custom else broadcast
         keys, worker = joining.keys, joining.worker
         self._settings = config.evaluator
         self._stop = stop

@@ -104,7 +104,7 @@ class PolicyPlayer:
 
     @property
     def first_q_values(self) -> Float32Array:
-        """Values [K, NUM_ACTIONS] by which the actions of the first arena were chosen last."""
+        """Values [K, A] by which the actions of the first arena were chosen last."""
         return self._q_values[: self._num_robots]
 
     @property

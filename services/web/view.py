@@ -131,7 +131,15 @@ def arena_view(arena: ArenaConfig) -> dict[str, Any]:
         "stack": arena.stack,
         "crop": arena.crop_px,
         "kind": arena.kind,
+        "custom": arena.is_custom,
+        "actions": _action_names(arena),
     }
+
+
+def _action_names(arena: ArenaConfig) -> list[str]:
+    if arena.is_custom:
+        return [f"action {number}" for number in range(arena.num_actions)]
+    return ["left", "straight", "right"]
 
 
 def _service(state: RunState, service: Service, now: float) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import av
 import pytest
+import torch
 
 from tests.system.system_processes import Command, end_all, run_name
 
@@ -12,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 @pytest.mark.parametrize(("world", "agents", "actions"), [("pong", 2, 3), ("grid", 1, 7)])
 def test_a_foreign_world_is_learned_judged_and_filmed(
     world: str, agents: int, actions: int, tmp_path: Path
@@ -35,3 +37,22 @@ def test_a_foreign_world_is_learned_judged_and_filmed(
     assert f"num_actions = {actions}" in settings
     with av.open(str(run / "evaluation.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) > 4
+    told = said("evaluate", run, "--episodes", "2", "--json", folder=tmp_path)
+    assert json.loads(told)["num_robots"] == agents
+    exported = tmp_path / "policy.ts"
+    assert "largest difference" in said("export", run, "--out", exported, folder=tmp_path)
+    network = torch.jit.load(str(exported))
+    assert network(torch.zeros((1, 4, 60, 60), dtype=torch.uint8)).shape == (1, actions)
+    resume = ["train", "--resume", run, "--run.learner_steps", "60", "--json", "--no-web"]
+    try:
+        again = json.loads(said(*resume, folder=tmp_path))
+    finally:
+        end_all(name)
+    assert again["learner_steps"] >= 60, again
+
+
+def said(*arguments: str | Path, folder: Path) -> str:
+    """What a command that must not fail prints."""
+    with Command(arguments, folder, PYTHONPATH=str(ROOT)) as command:
+        assert command.wait(600) == 0, command.err
+    return command.out

@@ -41,7 +41,7 @@ def test_all_are_back_and_heard_after_a_kill(tmp_path: Path) -> None:
         deaf = set(followers)
 
         def all_hear() -> bool:
-            """A subscription may come back after the presence, so it is published more than once."""
+            """A subscription may come back after the presence: publish more than once."""
             weights.put(b"newer")
             deaf.difference_update([follower for follower in deaf if follower.take()])
             return not deaf

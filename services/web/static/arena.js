@@ -6,8 +6,8 @@ const KEPT = 1200; // frames
 const LATE = 30; // frames behind, from which what comes is caught up with
 const TRAIL = 120; // frames
 const COLOURS = ["#ffffff", "#7fd99a", "#f5c26b", "#c9a7ff", "#6fd6de", "#ff9d94", "#d6e685", "#f7a8d8", "#9fc2ff", "#d9c9b0"];
-const ACTIONS = ["left", "straight", "right"];
 const OUTCOMES = { success: "success: every robot is on a target", collision: "over: too many collisions", timeout: "over: out of time" };
+const WORLD_OUTCOMES = { success: "success", collision: "over, without success", timeout: "over: out of time" };
 
 export class ArenaView {
   constructor() {
@@ -33,9 +33,10 @@ export class ArenaView {
     requestAnimationFrame((now) => this.#tick(now));
   }
 
-  // arena: lengths in px of the arena, of the run's settings.
+  // arena: of the run's settings. A custom world has no lengths: its agents' pictures are shown.
   configure(arena) {
     this.arena = arena;
+    byId("trails").parentElement.hidden = arena.custom;
   }
 
   clear() {
@@ -113,6 +114,37 @@ export class ArenaView {
     const arena = this.arena;
     const side = Math.round(this.canvas.clientWidth * devicePixelRatio) || 600;
     if (this.canvas.width !== side) this.canvas.width = this.canvas.height = side;
+    if (arena.custom) this.#drawPictures(frame, side);
+    else this.#drawArena(frame, place, side);
+    this.#tell(frame, place);
+    this.#drawRobots(frame, place);
+  }
+
+  // A custom world: the newest picture of each agent, side by side.
+  #drawPictures(frame, side) {
+    const c = this.context;
+    c.setTransform(1, 0, 0, 1, 0, 0);
+    c.fillStyle = "#000";
+    c.fillRect(0, 0, side, side);
+    const count = frame.robots.length;
+    const across = Math.ceil(Math.sqrt(count));
+    const cell = side / across;
+    const gap = count > 1 ? cell / 50 : 0;
+    const pixels = frame.view_px ** 2;
+    const picture = document.createElement("canvas");
+    c.imageSmoothingEnabled = false;
+    for (let agent = 0; agent < count && frame.pixels; agent += 1) {
+      drawViews(picture, [frame.pixels.subarray(agent * pixels, (agent + 1) * pixels)], frame.view_px);
+      const [x, y] = [(agent % across) * cell, Math.floor(agent / across) * cell];
+      c.strokeStyle = COLOURS[agent % COLOURS.length];
+      c.lineWidth = gap;
+      if (gap) c.strokeRect(x + gap / 2, y + gap / 2, cell - gap, cell - gap);
+      c.drawImage(picture, x + gap, y + gap, cell - 2 * gap, cell - 2 * gap);
+    }
+  }
+
+  #drawArena(frame, place, side) {
+    const arena = this.arena;
     const scale = side / arena.size;
     const c = this.context;
     c.setTransform(scale, 0, 0, scale, 0, 0);
@@ -162,8 +194,6 @@ export class ArenaView {
       c.lineWidth = 12;
       c.strokeRect(6, 6, arena.size - 12, arena.size - 12);
     }
-    this.#tell(frame, place);
-    this.#drawRobots(frame, place);
   }
 
   #drawTrails(frame, place, scale) {
@@ -197,10 +227,14 @@ export class ArenaView {
     ];
     byId("moment").textContent = words.join(" · ");
     const hits = frame.collided.map((hit, robot) => (hit ? robot + 1 : 0)).filter(Boolean);
-    const ending = OUTCOMES[frame.outcome] ?? "";
+    const custom = this.arena.custom;
+    const ending = (custom ? WORLD_OUTCOMES : OUTCOMES)[frame.outcome] ?? "";
     const said = ending ? `Episode ${frame.episode}: ${ending}.` : this.said;
     if (said !== this.said) byId("ending").textContent = this.said = said;
-    const label = `The arena: ${frame.robots.length} robots, ${frame.targets.length} targets, ${frame.obstacles.length} obstacles; frame ${frame.frame} of episode ${frame.episode}${hits.length ? `; robot ${hits.join(", ")} collided` : ""}${ending ? `; ${ending}` : ""}`;
+    const shows = custom
+      ? `The world, as its ${frame.robots.length} agents see it`
+      : `The arena: ${frame.robots.length} robots, ${frame.targets.length} targets, ${frame.obstacles.length} obstacles`;
+    const label = `${shows}; frame ${frame.frame} of episode ${frame.episode}${hits.length ? `; robot ${hits.join(", ")} collided` : ""}${ending ? `; ${ending}` : ""}`;
     if (!this.told || performance.now() - this.told > 2000 || ending) {
       this.canvas.setAttribute("aria-label", label);
       this.told = performance.now();
@@ -211,11 +245,11 @@ export class ArenaView {
   #drawRobots(frame, place) {
     const holder = byId("robots");
     while (holder.children.length > frame.robots.length) holder.lastChild.remove();
-    while (holder.children.length < frame.robots.length) holder.append(robotPanel(holder.children.length));
+    while (holder.children.length < frame.robots.length) holder.append(robotPanel(holder.children.length, this.arena));
     frame.robots.forEach((_, robot) => {
       const panel = holder.children[robot];
       drawViews(panel.querySelector("canvas"), this.#stack(frame, place, robot), frame.view_px);
-      drawValues(panel, frame.q_values[robot], frame.actions[robot]);
+      drawValues(panel, frame.q_values[robot], frame.actions[robot], this.arena);
     });
   }
 
@@ -233,18 +267,19 @@ export class ArenaView {
   }
 }
 
-function robotPanel(robot) {
+function robotPanel(robot, arena) {
+  const name = `${arena.custom ? "Agent" : "Robot"} ${robot + 1}`;
   const swatch = element("span", { className: "swatch", "aria-hidden": "true" });
   swatch.style.background = COLOURS[robot % COLOURS.length];
   const values = element("div", { className: "q" });
-  for (const action of ACTIONS) {
+  for (const action of arena.actions) {
     const track = element("span", { className: "track", "aria-hidden": "true" }, element("div", { className: "fill" }));
     values.append(element("span", {}, action), track, element("output", {}, "–"));
   }
-  const picture = element("canvas", { role: "img", "aria-label": `What robot ${robot + 1} sees: its last images, oldest first` });
+  const picture = element("canvas", { role: "img", "aria-label": `What ${name.toLowerCase()} sees: its last images, oldest first` });
   return element(
-    "section", { className: "robot card", "aria-label": `Robot ${robot + 1}` },
-    element("h3", {}, swatch, ` Robot ${robot + 1}`), picture, values,
+    "section", { className: "robot card", "aria-label": name },
+    element("h3", {}, swatch, ` ${name}`), picture, values,
     element("p", { className: "small quiet why" }, ""),
   );
 }
@@ -262,11 +297,11 @@ function drawViews(canvas, images, side) {
   });
 }
 
-function drawValues(panel, values, action) {
+function drawValues(panel, values, action, { actions, custom }) {
   const cells = panel.querySelector(".q").children;
   const why = panel.querySelector(".why");
   if (!values) {
-    for (let i = 0; i < ACTIONS.length; i += 1) {
+    for (let i = 0; i < actions.length; i += 1) {
       cells[3 * i].className = "";
       cells[3 * i + 1].firstChild.style.width = "0";
       cells[3 * i + 2].textContent = "–";
@@ -280,11 +315,11 @@ function drawValues(panel, values, action) {
   const best = values.indexOf(Math.max(...finite));
   values.forEach((value, i) => {
     cells[3 * i].className = i === action ? "chosen" : "";
-    cells[3 * i].textContent = `${i === action ? "▶ " : ""}${ACTIONS[i]}`;
+    cells[3 * i].textContent = `${i === action ? "▶ " : ""}${actions[i]}`;
     cells[3 * i + 1].firstChild.style.width = value === null ? "0" : `${8 + (92 * (value - low)) / span}%`;
     cells[3 * i + 2].textContent = number(value);
   });
-  why.textContent = `goes ${ACTIONS[action]}${action === best ? ", the best by its values" : ", at random: it explores"}`;
+  why.textContent = `${custom ? "takes" : "goes"} ${actions[action]}${action === best ? ", the best by its values" : ", at random: it explores"}`;
 }
 
 function disc(c, x, y, radius) {

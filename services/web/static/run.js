@@ -16,6 +16,7 @@ let tables = { history: {}, episodes: {}, tests: [] };
 let watched = ""; // role/worker; empty until frames come of the first actor, which the server finds
 let seenEvaluations = -1;
 
+const LEGEND_OF_A_WORLD = "The world as its agents see it: the newest picture of each, in grey as their network gets it. A worker plays far faster than anyone can follow: every frame of some of its episodes is shown, at 15 a second, so a little after it happened.";
 const arena = new ArenaView();
 const axis = new Axis(byId("axis"), () => load());
 const zoom = (from, to, along) => {
@@ -85,6 +86,7 @@ function showInfo() {
   ].filter(Boolean).join(" · ");
   if (settings) {
     arena.configure(settings.arena);
+    if (settings.arena.custom) byId("legend").textContent = LEGEND_OF_A_WORLD;
     showSettings(settings);
   } else {
     say("The settings of this run are of another version of mrcdrl: only its curves can be shown.");
@@ -185,8 +187,11 @@ function show(told) {
 
 function lead(told, up) {
   const info = about?.info ?? {};
-  const many = info.robots === 1 ? "One robot learns" : `${info.robots ?? "Some"} robots learn`;
-  const what = `${many} to reach ${info.robots === 1 ? "a target" : "a target each"} without touching anything, from what ${info.robots === 1 ? "it sees" : "each of them sees"}.`;
+  const one = info.robots === 1;
+  const who = about?.settings?.arena.custom ? "agent" : "robot";
+  const many = one ? `One ${who} learns` : `${info.robots ?? "Some"} ${who}s learn`;
+  const aim = who === "agent" ? "to act in a custom world" : `to reach ${one ? "a target" : "a target each"} without touching anything`;
+  const what = `${many} ${aim}, from what ${one ? "it sees" : "each of them sees"}.`;
   const best = told.best
     ? `The best weights so far reached ${percent(told.best.success_rate)} success in the test.`
     : "No test has come to its end yet.";

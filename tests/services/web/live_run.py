@@ -22,6 +22,16 @@ from tests.patience import PATIENCE_S
 from tests.services.web.web_server import record_run
 
 SMOKE = load_config("smoke", {"agent.n_step": "2"}, environ={})
+WORLD = load_config(
+    "smoke",
+    {
+        "arena.env": "nobody.imports:this",
+        "arena.num_actions": "5",
+        "arena.codec": "frames",
+        "learner.symmetries": "false",
+    },
+    environ={},
+)
 FRAMES = 40  # of an episode
 _PERIOD_S = 0.2  # between reports
 _STEP_S = 0.02  # between frames that the worker plays
@@ -110,10 +120,13 @@ class LiveRun(Closing):
             angles = 2 * math.pi * (frame / FRAMES + np.array([0.0, 0.5]))
             places = size * (0.5 + 0.3 * np.stack([np.cos(angles), np.sin(angles)], axis=1))
             scene = Scene(np.column_stack([places, angles + math.pi / 2]), targets)
+            if self.config.arena.is_custom:
+                scene = Scene(np.zeros((2, 3)), np.zeros((2, 2)))
             images = np.zeros((2, view, view), np.uint8)
             images[:, frame % view, :] = 255
             moment = Moment(frame, scene, images, 3, 0.25)
-            values = np.array([[0.1, 0.2, 0.3], [-1.0, 0.5, 0.2]], np.float32)
+            values = np.full((2, self.config.arena.action_count), -2, np.float32)
+            values[:, :3] = [[0.1, 0.2, 0.3], [-1.0, 0.5, 0.2]]
             self._broadcast.acts(moment, values, np.array([2, 0], np.uint8))
             frame += 1
             last = frame == FRAMES

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 from mrcdrl.common.config import Config
 from mrcdrl.common.messages.trajectory import Stats
 from tests.patience import PATIENCE_S, eventually
-from tests.services.web.live_run import SMOKE, LiveRun
+from tests.services.web.live_run import SMOKE, WORLD, LiveRun
 from tests.services.web.watched import PATIENCE_MS, Watched
 from tests.services.web.web_server import Served, record_run, served
 
@@ -53,6 +53,24 @@ def test_a_run_is_watched_from_its_page(watched: Watched, server: Served, live: 
     assert "samples per insert 4" in before
     assert watched.said == []
     assert watched.asked == {f"127.0.0.1:{server.port}"}
+
+
+def test_a_custom_world_is_watched_by_what_its_agents_see(watched: Watched, tmp_path: Path) -> None:
+    with LiveRun(tmp_path / "runs" / "live", WORLD) as run, served(run.path.parent) as up:
+        page = open_run(watched, up)
+        eventually(lambda: frame_shown(page)[1] >= 0, "a picture of the world")
+        agents = page.locator("#robots .robot")
+        expect(agents.nth(0)).to_contain_text("takes action 2, the best")
+        expect(agents.nth(1)).to_contain_text("takes action 0, at random")
+        expect(agents.nth(0).locator(".track")).to_have_count(5)
+        expect(page.locator("#legend")).to_contain_text("as its agents see it")
+        label = page.locator("#arena-canvas").get_attribute("aria-label") or ""
+        assert label.startswith("The world, as its 2 agents see it")
+        expect(page.locator("#ending")).to_contain_text("success.")
+        shades = "c => new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size"
+        assert page.locator("#arena-canvas").evaluate(shades) > 2, "nothing is drawn"
+        expect(page.locator("#trails")).to_be_hidden()
+    assert watched.said == []
 
 
 def test_a_page_watches_by_one_stream(watched: Watched, server: Served) -> None:
