@@ -338,6 +338,16 @@ class AgentConfig(Section):
     occupied_targets_pay: Annotated[bool, Kept()] = True
     """Whether a robot also learns from what it is paid on a target that another robot is nearer to;
     without, such a frame counts as one off target. (paper: true)"""
+    demonstrator: Literal["none", "potential_field"] = "none"
+    """`potential_field`: in every sampled state the network is also drawn to the action of that
+    controller, **which sees the true state**, by a margin (Hester et al. 2018). The states are the
+    learner's own (Ross et al. 2011). The test never sees it. (ours)"""
+    demonstration_margin: Positive = 0.2
+    """By how much the value of the action shown is to exceed the others', in scaled rewards. (ours;
+    DQfD: 0.8)"""
+    demonstration_schedule: Schedule = ((0, 1.0),)
+    """Points (learner step, weight 0 to 100 of the margin's loss), linear between, constant after
+    the last. (ours; DQfD: 1)"""
     reward_scale: Annotated[Positive, Kept()] = 1.0
     """Factor on the rewards in the learner's target. (ours)"""
     loss: Literal["squared", "huber"] = "squared"
@@ -370,7 +380,8 @@ class AgentConfig(Section):
         _check_schedule("learning_rate_schedule", self.learning_rate_schedule)
         if any(factor <= 0 for _, factor in self.learning_rate_schedule):
             raise ValueError("learning_rate_schedule has a factor that is not above 0")
-        for name, most in (("shaping_schedule", 1), ("collision_schedule", 100)):
+        schedules = ("shaping_schedule", 1), ("collision_schedule", 100)
+        for name, most in (*schedules, ("demonstration_schedule", 100)):
             points = getattr(self, name)
             _check_schedule(name, points)
             if any(not 0 <= factor <= most for _, factor in points):
@@ -718,6 +729,11 @@ class Config(Section):
             )
         if self.arena.is_custom:
             self._check_custom()
+        if self.agent.demonstrator != "none" and self.arena.codec != "scene":
+            raise ValueError(
+                f"agent.demonstrator needs the poses in the records: arena.codec is "
+                f"{self.arena.codec!r}, not 'scene'"
+            )
         if self.run.turn_size:
             self._check_lockstep()
         return self
@@ -729,6 +745,7 @@ class Config(Section):
             "agent.shaping_per_px": agent.shaping_per_px > 0,
             "agent.collision_schedule": any(factor != 1 for _, factor in agent.collision_schedule),
             "agent.occupied_targets_pay": not agent.occupied_targets_pay,
+            "agent.demonstrator": agent.demonstrator != "none",
         }
         for name, given in needing.items():
             if given:

@@ -19,7 +19,13 @@ from typing_extensions import TypeVar
 from mrcdrl.common.config import ReplayConfig
 from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.errors import WireError
-from mrcdrl.common.messages.trajectory import NUM_ACTIONS, Float32Array, Int64Array, Samples
+from mrcdrl.common.messages.trajectory import (
+    NUM_ACTIONS,
+    Float32Array,
+    Int64Array,
+    Samples,
+    UInt8Array,
+)
 from mrcdrl.services.learner.rendering import Renderer, SymmetryRows, to_device
 
 S = TypeVar("S", default=Tensor)
@@ -51,6 +57,18 @@ class Ahead:
 
 
 @dataclass(frozen=True, slots=True)
+class Demonstration:
+    """What a demonstrator does in the states of a batch."""
+
+    actions: Tensor  # int64 [B]
+    weights: Tensor  # float32 [B], of the margin's loss
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The same with each tensor changed."""
+        return replace(self, actions=change(self.actions), weights=change(self.weights))
+
+
+@dataclass(frozen=True, slots=True)
 class Batch(Generic[S]):
     """What one learner step reads; states are tensors, or what a fast first layer takes."""
 
@@ -62,16 +80,20 @@ class Batch(Generic[S]):
     importance_weights: Tensor  # float32 [B], largest is 1
     keys: Int64Array  # [B], of the transitions in replay
     ahead: Ahead | None = None
+    demonstration: Demonstration | None = None
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """What a step needs."""
-        return tuple(getattr(self, name) for name in _TENSORS)
+        shown = self.demonstration
+        own = tuple(getattr(self, name) for name in _TENSORS)
+        return own if shown is None else (*own, shown.actions, shown.weights)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The batch with each of its tensors changed, and the same keys."""
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _TENSORS}
-        return replace(self, **changed)
+        shown = self.demonstration
+        return replace(self, **changed, demonstration=shown and shown.map(change))
 
     def __getitem__(self, rows: slice) -> Self:
         """Some of its transitions, as views."""
@@ -89,10 +111,12 @@ class Batch(Generic[S]):
             self.importance_weights,
             self.keys,
             self.ahead,
+            self.demonstration,
         )
 
 
-_TENSORS = tuple(field.name for field in fields(Batch) if field.name not in {"keys", "ahead"})
+_OTHERS = {"keys", "ahead", "demonstration"}
+_TENSORS = tuple(field.name for field in fields(Batch) if field.name not in _OTHERS)
 
 
 def importance_exponent_at(replay: ReplayConfig, learner_step: int) -> float:
@@ -117,21 +141,22 @@ def collate(
     symmetry_rows: SymmetryRows = (),
     beta: float = 0.0,
     num_actions: int = NUM_ACTIONS,
+    demonstrate: Callable[[UInt8Array], UInt8Array] | None = None,
+    demonstration_weight: float = 0.0,
 ) -> Batch:
     """The batch of these samples, on the renderer's device.
 
     symmetry_rows: symmetries, each with the transitions that undergo it. beta: of the importance
-    weights; 0 makes them 1.
+    weights; 0 makes them 1. demonstrate: actions [B] in the states whose newest records are [B, R].
 
     Raises WireError if an action or a bootstrap offset is outside what the records hold.
     """
     _check(samples, stack, num_actions)
-    actions = samples.actions.copy()
-    for symmetry, rows in symmetry_rows:
-        actions[rows] = symmetry.apply_to_actions(actions[rows])
+    actions = _mapped(samples.actions, symmetry_rows)
     images = render(samples.records, symmetry_rows)
     device = images.device
     offsets = to_device(samples.bootstrap_offsets.astype(np.int64), device)
+    shown = None if demonstrate is None else demonstrate(samples.records[:, stack - 1])
     each = torch.arange(len(samples), device=device)[:, None]
     window = offsets[:, None] + torch.arange(stack, device=device)
     return Batch(
@@ -142,7 +167,21 @@ def collate(
         next_observation=images[each, window],
         importance_weights=to_device(importance_weights(samples, beta), device),
         keys=samples.keys.copy(),  # the samples are valid for a while only
+        demonstration=None
+        if shown is None
+        else Demonstration(
+            to_device(_mapped(shown, symmetry_rows).astype(np.int64), device),
+            to_device(np.full(len(shown), demonstration_weight, np.float32), device),
+        ),
     )
+
+
+def _mapped(actions: UInt8Array, symmetry_rows: SymmetryRows) -> UInt8Array:
+    """The actions [B] after the symmetries that their rows undergo."""
+    mapped = actions.copy()
+    for symmetry, rows in symmetry_rows:
+        mapped[rows] = symmetry.apply_to_actions(mapped[rows])
+    return mapped
 
 
 def _check(samples: Samples, stack: int, num_actions: int) -> None:

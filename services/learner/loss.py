@@ -41,7 +41,7 @@ def td_loss(
     """Loss and TD errors of a batch; online, target: states to values float32 [B, A].
 
     A discount of 0 leaves the bootstrap out, whatever the values of the next state are. Only the
-    values of the actions taken have a gradient.
+    values of the actions taken have a gradient, and those that a demonstration compares.
     """
     with torch.no_grad():
         next_q = target(batch.next_observation)
@@ -62,8 +62,22 @@ def td_loss(
     else:  # half the square up to an error of 1, then linear
         losses = functional.huber_loss(taken, y, reduction="none")
     loss = torch.mean(batch.importance_weights * losses)
+    if batch.demonstration is not None:
+        shown = batch.demonstration
+        short = _short_of_margin(shown.actions, q, agent.demonstration_margin)
+        loss = loss + torch.mean(shown.weights * short)
     q = q.detach()
     return TDLoss(loss, td_errors=y - taken.detach(), greedy_q=q.max(dim=1).values)
+
+
+def _short_of_margin(action: Tensor, q: Tensor, margin: float) -> Tensor:
+    """max_a (q(a) + margin if a is not the action shown) - q(action) [B], of actions [B]; >= 0.
+
+    The large-margin loss of DQfD (Hester et al. 2018, section 4): 0 once the action shown is the
+    best by the margin.
+    """
+    raised = (q + margin).scatter(1, action.unsqueeze(1), _values_of(action, q).unsqueeze(1))
+    return raised.max(dim=1).values - _values_of(action, q)
 
 
 def _log_policy_term(q: Tensor, action: Tensor, agent: AgentConfig) -> Tensor:

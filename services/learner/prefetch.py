@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 
 from mrcdrl.common.config import Config
+from mrcdrl.common.config.schedule import value_at
 from mrcdrl.common.errors import WireError
 from mrcdrl.common.messages.fitting import Fitting
 from mrcdrl.common.messages.trajectory import Samples
@@ -20,6 +21,7 @@ from mrcdrl.common.runtime.process import StopSignal
 from mrcdrl.common.runtime.repeats import is_logged
 from mrcdrl.services.learner.accelerate.side_stream import on_side_stream
 from mrcdrl.services.learner.batch import Batch, collate, importance_exponent_at
+from mrcdrl.services.learner.demonstrator import demonstrator
 from mrcdrl.services.learner.learner import Learner
 from mrcdrl.services.learner.rendering import make_renderer
 from mrcdrl.services.learner.symmetries import LayoutSymmetries
@@ -121,6 +123,7 @@ def make_collate(
     fitting = Fitting(config)
     symmetries = LayoutSymmetries(config.arena) if config.learner.symmetries else None
     render = make_renderer(config.arena, learner.device, rendering_threads)
+    demonstrate = None if config.agent.demonstrator == "none" else demonstrator(config.arena)
 
     def collated(samples: Samples) -> Batch:
         fitting.check(samples)
@@ -132,6 +135,10 @@ def make_collate(
             symmetry_rows=drawn,
             num_actions=config.arena.action_count,
             beta=importance_exponent_at(config.replay, learner.learner_step),
+            demonstrate=demonstrate,
+            demonstration_weight=value_at(
+                config.agent.demonstration_schedule, learner.learner_step
+            ),
         )
 
     return on_side_stream(collated, learner.device)

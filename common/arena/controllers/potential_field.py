@@ -33,43 +33,55 @@ class PotentialField:
         """Chooses actions [K] along the force on each robot."""
         if self._assignment is None:
             self._assignment = shortest_assignment(scene)
-        places = scene.robots[:, :2]
-        aims = scene.targets[self._assignment] - places
-        distances = np.linalg.norm(aims, axis=1, keepdims=True)
-        forces = aims / np.maximum(distances, _LEAST_PX)
-        forces = forces + self._from_robots(places) + self._from_walls(places)
-        forces = forces + self._from_obstacles(places, scene.obstacles)
-        return actions_towards(scene.robots[:, 2], bearings_rad(forces), self._config)
+        num = len(scene.robots)
+        others = np.repeat(scene.robots[None, :, :2], num, axis=0)
+        others[np.arange(num), np.arange(num)] = np.nan
+        obstacles = np.broadcast_to(scene.obstacles, (num, *scene.obstacles.shape))
+        targets = scene.targets[self._assignment]
+        return field_actions(scene.robots, targets, others, obstacles, self._config)
 
-    def _from_robots(self, places: Float64Array) -> Float64Array:
-        """Repulsion [K, 2] from the other robots."""
-        apart = places[:, None] - places[None]
-        distances = np.linalg.norm(apart, axis=2)
-        np.fill_diagonal(distances, np.inf)
-        gaps = distances - 2 * self._config.robot_radius_px
-        push: Float64Array = (
-            (_strength(gaps, _ROBOTS_FROM_PX) / distances)[..., None] * apart
-        ).sum(axis=1)
-        return push
 
-    def _from_walls(self, places: Float64Array) -> Float64Array:
-        """Repulsion [K, 2] from the four outer walls."""
-        low, high = reachable_px(self._config)
-        near, far = (
-            _strength(places - low, _WALLS_FROM_PX),
-            _strength(high - places, _WALLS_FROM_PX),
-        )
-        return near - far
+def field_actions(
+    poses: Float64Array,
+    targets: Float64Array,
+    others: Float64Array,
+    obstacles: Float64Array,
+    config: ArenaConfig,
+) -> UInt8Array:
+    """Actions [N] along the forces on robots at poses [N, 3], whose targets [N, 2] attract them.
 
-    def _from_obstacles(self, places: Float64Array, obstacles: Float64Array) -> Float64Array:
-        """Repulsion [K, 2] from obstacles and inner walls."""
-        offsets, widths = offsets_from(self._config, places, obstacles)
-        distances = np.linalg.norm(offsets, axis=2)
-        gaps = distances - widths - self._config.robot_radius_px
-        push: Float64Array = (
-            (_strength(gaps, _WALLS_FROM_PX) / distances)[..., None] * offsets
-        ).sum(axis=1)
-        return push
+    others: [N, J, 2], the robots beside each; obstacles: [N, O, 3]. What is NaN is not there.
+    """
+    places = poses[:, :2]
+    aims = targets - places
+    forces = aims / np.maximum(np.linalg.norm(aims, axis=1, keepdims=True), _LEAST_PX)
+    forces = forces + _from_walls(places, config)
+    radius = config.robot_radius_px
+    robots = np.full(others.shape[:-1], radius)
+    forces = forces + _from_discs(places[:, None] - others, robots, radius, _ROBOTS_FROM_PX)
+    discs = places[:, None] - obstacles[..., :2]
+    forces = forces + _from_discs(discs, obstacles[..., 2], radius, _WALLS_FROM_PX)
+    walls, widths = offsets_from(config, places, np.empty((0, 3)))
+    forces = forces + _from_discs(walls, widths, radius, _WALLS_FROM_PX)
+    return actions_towards(poses[:, 2], bearings_rad(forces), config)
+
+
+def _from_discs(
+    offsets: Float64Array, radii: Float64Array, own_radius: float, from_px: float
+) -> Float64Array:
+    """Repulsion [N, 2] at these offsets [N, J, 2] from the centres of discs with these radii."""
+    distances = np.linalg.norm(offsets, axis=2)
+    strength = _strength(distances - radii - own_radius, from_px)
+    push: Float64Array = np.nan_to_num((strength / distances)[..., None] * offsets).sum(axis=1)
+    return push
+
+
+def _from_walls(places: Float64Array, config: ArenaConfig) -> Float64Array:
+    """Repulsion [N, 2] from the four outer walls."""
+    low, high = reachable_px(config)
+    near = _strength(places - low, _WALLS_FROM_PX)
+    far = _strength(high - places, _WALLS_FROM_PX)
+    return near - far
 
 
 def _strength(gaps_px: Float64Array, from_px: float) -> Float64Array:

@@ -89,9 +89,19 @@ class SceneCodec:
 
     def present(self, records: UInt8Array) -> Int64Array:
         """How many robots are in the scene of each record [..., R]."""
-        robots = np.ascontiguousarray(records).view(_NUMBER)[..., : self._ends[0]]
-        count: Int64Array = np.isfinite(robots[..., ::3]).sum(axis=-1)
+        count: Int64Array = np.isfinite(self.scenes(records).robots[..., 0]).sum(axis=-1)
         return count
+
+    def scenes(self, records: UInt8Array) -> Scene:
+        """The scenes [...] of records [..., R], stacked, in each the record's own robot first."""
+        numbers = np.ascontiguousarray(records).view(_NUMBER)
+        parts = np.split(numbers, self._ends, axis=-1)[:3]
+        shapes = ((*numbers.shape[:-1], -1, width) for width in (3, 2, 3))
+        robots, targets, obstacles = (
+            part.reshape(shape).astype(np.float64)
+            for part, shape in zip(parts, shapes, strict=True)
+        )
+        return Scene(robots, targets, obstacles)
 
     def _scene_of(self, numbers: Float32Array) -> Scene:
         with np.errstate(invalid="ignore"):
