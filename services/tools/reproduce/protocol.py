@@ -19,7 +19,8 @@ FIG5_ROBOTS = 2
 TESTED_ROBOTS = 4  # of Table 2
 RATE_FACTORS = (0.5, 1.0, 2.0)  # of the sweep, times the base's learning rate
 SWEEP_ROBOTS = 2
-ONE_VIEW = {"agent.symmetric_views": 1}  # the test is the paper's, whatever the base has
+# The test and the weights are the paper's, whatever the base has.
+AS_PRINTED = {"agent.symmetric_views": 1, "learner.average_decay": 0.0}
 RATES = dict.fromkeys(KINDS, 1.0)
 """Factor of each kind's learning rate in all runs but the sweep's; set by the sweep's rule."""
 
@@ -33,7 +34,7 @@ class Scale:
     base: str  # preset
     budget: Mapping[int, int]  # learner steps by number of robots: those of Tables 1 and 2
     seeds: Mapping[int, Sequence[int]]  # by number of robots
-    settings: Mapping[str, Any] = field(default_factory=dict)  # of every run, over ONE_VIEW
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of every run, over AS_PRINTED
     rate_fits: bool = False  # the learning rate falls over each budget as over that of 4 robots
     weights: Sequence[float] = ()  # p of Fig. 5 beside that of all other runs
     fig5_seeds: Sequence[int] = ()
@@ -153,7 +154,7 @@ def plan(scale: Scale) -> Plan:
     def cells(
         variant: str, kind: str, robots: int, seeds: Sequence[int], factor: float, **settings: Any
     ) -> list[Cell]:
-        chosen = {**ONE_VIEW, **scale.settings, "agent.kind": kind, **settings}
+        chosen = {**AS_PRINTED, **scale.settings, "agent.kind": kind, **settings}
         if factor != 1.0:
             chosen["agent.learning_rate"] = factor * rate
         return _cells(scale, variant, robots, seeds, chosen)

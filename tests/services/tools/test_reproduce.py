@@ -100,6 +100,14 @@ def test_no_run_is_made_twice(scale: Scale) -> None:
     assert named == {cell.name for cell in every}
 
 
+def test_the_runs_that_are_kept_are_runs_of_the_protocol() -> None:
+    """A preset that changes must not make other runs of those that were planned."""
+    kept = ROOT / "benchmarks" / "results" / "reproduction"
+    done = {path.stem for path in (kept / "cpu" / "cells").glob("*.done")}
+    assert done
+    assert done <= {cell.name for cell in CPU.part("all")}
+
+
 def test_the_numbers_of_seeds_are_those_of_the_page() -> None:
     assert {kind: len(CPU.kinds[kind, 4]) for kind in KINDS} == dict.fromkeys(KINDS, 5)
     assert len(plan(SCALES["gpu"]).kinds["duel", 4]) == 10
