@@ -36,6 +36,8 @@ MEASURED = {
     "thousand/weights-ways.jsonl": ("weights_ways", "--readers", "100", "--rounds", "2"),
 }
 
+_TWO_ROBOTS = tuple(f"quick-sooner/2robots-averages-s{seed}.jsonl" for seed in range(3))
+
 # Of 100 000 transitions in chunks of 50, counted by the table that takes it all at its start.
 _FRAMES_MB = 388.4
 
@@ -210,11 +212,12 @@ def success(lines: Lines) -> list[Row]:
         return next(reached, None)
 
     (theirs,) = lines("system/sb3-training.jsonl", test_successes_of_100=92)
-    ours = minutes("quick-sooner/2robots-views.jsonl", 0.9) or float("nan")
+    never = float("inf")
+    ours = median(minutes(name, 0.94) or never for name in _TWO_ROBOTS)
     peer = theirs["cpu_minutes"]
     rows = [
         Row(
-            "2 robots, 90 of 100 starts, one seed",
+            "2 robots, 94 of 100 starts (the peer 92), median of three seeds",
             f"{ours:.1f} min",
             f"{peer:.0f} min of processor time, stable-baselines3",
             peer / ours,
@@ -310,7 +313,7 @@ TABLES = (
         "paper's test.",
         success,
         (
-            "quick-sooner/2robots-views.jsonl",
+            *_TWO_ROBOTS,
             "quick-sooner/4robots-views.jsonl",
             "system/sb3-training.jsonl",
         ),

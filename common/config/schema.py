@@ -573,8 +573,12 @@ class LearnerConfig(Section):
     checkpoint_period_s: Seconds = 60.0
     """Time between checkpoints. (ours)"""
     average_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Part of an exponential average of the parameters that a learner step keeps. Actors and
-    evaluators then act by the average, and the best one is kept; 0: no average. (ours)"""
+    """Part of an exponential average of the parameters that a learner step keeps. It is tested, and
+    the best one is kept; 0: no average. (ours)"""
+    average_for: Literal["all", "evaluation"] = "all"
+    """Who acts by the average: `all`: actors, evaluators and robots. `evaluation`: evaluators and
+    robots, while actors act by the newest parameters, so that their transitions stay fresh.
+    (ours)"""
     initial_weights: Annotated[str, Kept()] = ""
     """Weights file or run directory from whose weights a new run starts: for other numbers of
     robots, other targets, or a kind whose parameters are the same; empty: random. (ours)"""
@@ -584,6 +588,11 @@ class LearnerConfig(Section):
     """Time without a batch after which the learner logs whom it waits for. (ours)"""
     seed: Seed = 0
     """Seed of the initial parameters and the random symmetries. (ours)"""
+
+    @property
+    def average_apart(self) -> bool:
+        """Whether what is tested are other weights than those that actors act by."""
+        return self.average_decay > 0 and self.average_for == "evaluation"
 
     @property
     def sample_size(self) -> int:

@@ -56,7 +56,8 @@ class LivePolicy(Closing):
             session = opened.enter_context(Session(transport, open_timeout_s=timeout_s))
             self.config = fetch_config(session, joining, stop, timeout_s)
             self._policy = make_policy(self.config)
-            self._reader = WeightsReader(session, joining.keys, self._adopt)
+            averages = self.config.learner.average_apart
+            self._reader = WeightsReader(session, joining.keys, self._adopt, averages=averages)
             if self._reader.wait(stop, timeout_s) is None:
                 raise DeadlineError(
                     f"no weights of run {run!r} came within {timeout_s:g} s; is its learner up?"

@@ -3,7 +3,7 @@
 A notice of some 300 bytes goes to all. On the learner's host a reader takes the weights from sealed
 memory that the notice names; on any other, one process asks the learner and hands on to the rest
 (`host_share.py`). Weights are published in full only while somebody subscribes to that, which no
-process of ours does.
+process of ours does. Where averages are for evaluation alone, whoever tests asks for these instead.
 
 Invariants: a reader's weights only ever get newer, by (epoch, version), and only what was adopted
 makes others old; a message that is torn, altered or of another network is refused: counted and
@@ -57,12 +57,13 @@ class WeightsWriter:
         self._share = session.shares_memory
         self._memories: deque[SealedMemory] = deque(maxlen=_KEPT)
         self._changed = threading.Condition()
-        self._newest: Weights | None = None
-        self._published: Weights | None = None
+        self._newest: tuple[Weights, Weights] | None = None  # and their average
+        self._published: tuple[Weights, Weights] | None = None
         self._answers: dict[str, bytes] = {}  # the newest by key, once announced
         self._answered = 0  # bytes of weights since the last notice
         self._stopping = False
-        servers = [(key, session.server(key)) for key in (keys.weights, keys.weights_notice)]
+        served = (keys.weights, keys.weights_notice, keys.weights_average)
+        servers = [(key, session.server(key)) for key in served]
         self._threads = [threading.Thread(target=self._publish, name="weights-publish")] + [
             threading.Thread(target=self._serve, args=each, name="weights-serve")
             for each in servers
@@ -71,10 +72,13 @@ class WeightsWriter:
         for thread in self._threads:
             thread.start()
 
-    def publish(self, weights: Weights) -> None:
-        """Take the newest weights to be announced; returns at once."""
+    def publish(self, weights: Weights, average: Weights | None = None) -> None:
+        """Take the newest weights to be announced; returns at once.
+
+        average: what is tested in their place, of the same version; None: they are.
+        """
         with self._changed:
-            self._newest = weights
+            self._newest = weights, average or weights
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -93,15 +97,20 @@ class WeightsWriter:
                     lambda: self._newest is not self._published or self._stopping
                 )
                 self._await_link(began_s)
-                weights = self._newest
-                if weights is None or weights is self._published:
+                newest = self._newest
+                if newest is None or newest is self._published:
                     return
-                self._published = weights
+                self._published = newest
             began_s = time.monotonic()
+            weights, average = newest
             notice, whole = encode(self._notice_of(weights)), encode(weights)
+            answers = {
+                self._keys.weights: whole,
+                self._keys.weights_notice: notice,
+                self._keys.weights_average: whole if average is weights else encode(average),
+            }
             with self._changed:
-                self._answers = {self._keys.weights: whole, self._keys.weights_notice: notice}
-                self._answered = 0
+                self._answers, self._answered = answers, 0
             try:
                 self._notices.put(notice)
                 if self._whole.watched:
@@ -146,7 +155,7 @@ class WeightsWriter:
             if answer is None:
                 request.throttle("no weights yet")
                 continue
-            if key == self._keys.weights:
+            if key != self._keys.weights_notice:
                 with self._changed:
                     self._answered += len(answer)
             request.reply(answer)
@@ -167,14 +176,17 @@ class WeightsReader:
         keys: Keys,
         adopt: Callable[[Weights], None] = lambda _weights: None,
         *,
+        averages: bool = False,
         silence_s: float = _SILENCE_S,
     ) -> None:
+        """averages: ask for these; they are neither in memory nor handed on."""
         whom, low = "the learner", Priority.LOW
-        self._shares_memory = session.shares_memory
+        self._shares_memory = session.shares_memory and not averages
         self._subscriber = session.latest_subscriber(keys.weights_notice, self._opened)
         self._notices = session.client(keys.weights_notice, whom, timeout_s=2.0, priority=low)
-        self._wholes = session.client(keys.weights, whom, priority=low)
-        self._host = HostShare(keys.run, enabled=session.shares_memory)
+        wholes = keys.weights_average if averages else keys.weights
+        self._wholes = session.client(wholes, whom, priority=low)
+        self._host = HostShare(keys.run, enabled=self._shares_memory)
         self._adopt = adopt
         self._silence_s = silence_s
         self._ask_at_s = time.monotonic() + silence_s

@@ -7,6 +7,7 @@ mrcdrl/<run>/config                    query: nothing -> the configuration as TO
 mrcdrl/<run>/leases                    query: LeaseRequest -> LeaseReply
 mrcdrl/<run>/weights                   publication and query: Weights
 mrcdrl/<run>/weights/notice            publication and query: WeightsNotice
+mrcdrl/<run>/weights/average           query: nothing -> Weights
 mrcdrl/<run>/evaluation/<worker>       publication: Evaluation
 mrcdrl/<run>/episodes/<actor>          publication: EpisodeSummary
 mrcdrl/<run>/stats/<role>/<worker>     publication: Stats
@@ -53,6 +54,10 @@ class Keys:
     @property
     def weights_notice(self) -> str:
         return f"mrcdrl/{self.run}/weights/notice"
+
+    @property
+    def weights_average(self) -> str:
+        return f"mrcdrl/{self.run}/weights/average"
 
     def evaluation(self, worker: str) -> str:
         return f"mrcdrl/{self.run}/evaluation/{worker}"

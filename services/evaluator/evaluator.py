@@ -60,7 +60,9 @@ class Evaluator:
             session.publisher(keys.stats("evaluator", worker)), "evaluator", worker, warms_up=True
         )
         self._evaluate_all = AllNumbers(config, worker, self._before_frame, broadcast)
-        self._reader = WeightsReader(session, keys, self._evaluate_all.adopt)
+        self._reader = WeightsReader(
+            session, keys, self._evaluate_all.adopt, averages=config.learner.average_apart
+        )
         self._best = BestWeights(
             joining.run_dir / BEST_WEIGHTS,
             AllNumbers(confirming(config), worker, self._before_frame),

@@ -82,6 +82,7 @@ class Learner:
         self.target = target.to(self.device).requires_grad_(requires_grad=False)
         self.target.load_state_dict(self.online.state_dict())
         decay = learner.average_decay
+        self._average_apart = learner.average_apart
         self._average = ParameterAverage(self.online, decay) if decay else None
         on_cpu = self.device.type == "cpu"
         self._step: GradientStep = AcceleratedStep(
@@ -152,15 +153,19 @@ class Learner:
         return self._step.ahead(batch)
 
     def payload(self) -> bytes:
-        """The parameters for publication: their average where the settings want one.
+        """The parameters that actors act by: the newest, or their average.
 
         Raises DivergedError if one is not finite.
         """
-        return self._to_bytes(self.published, self._sent_as)
+        return self._to_bytes(self.online if self._average_apart else self.tested, self._sent_as)
+
+    def average_payload(self) -> bytes:
+        """The average where actors act by other parameters, else empty; raises DivergedError."""
+        return self._to_bytes(self.tested, self._sent_as) if self._average_apart else b""
 
     @property
-    def published(self) -> QNetwork:
-        """The network whose parameters are published."""
+    def tested(self) -> QNetwork:
+        """The network whose parameters are tested and kept: the average, if there is one."""
         return self.online if self._average is None else self._average.network
 
     def start_from(self, payload: bytes) -> None:
@@ -188,7 +193,7 @@ class Learner:
             target=self._to_bytes(self.target, torch.float32),
             optimizer=write_safetensors(moments),
             rng_state=dict(self.rng.bit_generator.state),
-            average=b"" if self._average is None else self._to_bytes(self.published, torch.float32),
+            average=b"" if self._average is None else self._to_bytes(self.tested, torch.float32),
         )
 
     def restore(self, state: LearnerState) -> None:

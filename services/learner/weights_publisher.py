@@ -76,8 +76,12 @@ class WeightsPublisher:
             self.save()
         self.version += 1
         learner = self._learner
-        weights = Weights.of(self.epoch, self.version, learner.learner_step, learner.payload())
-        self._writer.publish(weights)
+        payloads = learner.payload(), learner.average_payload()
+        weights, average = (
+            Weights.of(self.epoch, self.version, learner.learner_step, payload)
+            for payload in payloads
+        )
+        self._writer.publish(weights, average if average.payload else weights)
 
     def maybe_save(self) -> None:
         """Save if the checkpoint period has passed; what cannot be written now is tried again."""

@@ -32,6 +32,7 @@ SERVED = {
     "priorities": RUN.priorities(),
     "weights": RUN.weights,
     "notice": RUN.weights_notice,
+    "average": RUN.weights_average,
 }
 PUBLISHED = {
     "weights": RUN.weights,
@@ -68,19 +69,19 @@ MAY = {
     "learner": Row(
         put=("weights", "notice", "stats of learner"),
         ask=("config", "sample", "priorities"),
-        serve=("weights", "notice"),
+        serve=("weights", "notice", "average"),
         announce=("live learner",),
     ),
     "actor": Row(
         put=("episodes", "arena of actor", "stats of actor"),
         follow=("weights", "notice"),
-        ask=("config", "leases", "insert", "weights", "notice"),
+        ask=("config", "leases", "insert", "weights", "notice", "average"),
         announce=("live actor",),
     ),
     "evaluator": Row(
         put=("evaluation", "arena of evaluator", "stats of evaluator"),
         follow=("weights", "notice"),
-        ask=("config", "weights", "notice"),
+        ask=("config", "weights", "notice", "average"),
         announce=("live evaluator",),
     ),
     "status": Row(
@@ -94,10 +95,10 @@ MAY = {
             *("arena of actor", "arena of evaluator"),
             *(f"stats of {role}" for role in ROLES),
         ),
-        ask=("config", "weights", "notice"),
+        ask=("config", "weights", "notice", "average"),
         watch=tuple(LIVE),
     ),
-    "robot": Row(follow=("weights", "notice"), ask=("config", "weights", "notice")),
+    "robot": Row(follow=("weights", "notice"), ask=("config", "weights", "notice", "average")),
 }
 
 

@@ -477,6 +477,21 @@ def test_readers_of_the_learners_host_cost_its_link_nothing(network: Network) ->
             assert reader.latest(PATIENCE_S) == weights(0, version)
 
 
+@pytest.mark.parametrize("shared_memory", [True, False])
+def test_averages_are_got_by_those_who_ask_for_them(
+    network: Network, writer: WeightsWriter, *, shared_memory: bool
+) -> None:
+    """Where there are none, they get what all get."""
+    session = network.join(shared_memory=shared_memory)
+    tester, actor = WeightsReader(session, KEYS, averages=True), WeightsReader(session, KEYS)
+    for version in range(1, 4):
+        average = Weights.of(0, version, 10 * version, b"a" * 100) if version < 3 else None
+        writer.publish(weights(0, version), average)
+        for reader, expected in ((tester, average), (actor, None)):
+            found = reader.wait(StopSignal()) if version == 1 else reader.latest(PATIENCE_S)
+            assert found == (expected or weights(0, version))
+
+
 def test_whoever_subscribes_to_weights_in_full_gets_them(network: Network) -> None:
     follower = network.join().latest_subscriber(KEYS.weights)
     with closing(WeightsWriter(network.join(), KEYS)) as writer:

@@ -30,6 +30,7 @@ SMALL = {
     "arena.view_px": "32",
     "arena.max_frames": "20",
     "learner.precision": "float32",
+    "learner.average_decay": "0",  # the announcer below has no averages
     "evaluator.episodes": "1",
     "evaluator.period_s": "0",
     "evaluator.max_share": "1",

@@ -17,7 +17,7 @@ AVERAGED = FLOAT32.model_copy(update={"average_decay": 0.9})
 
 
 def averaged(learner: Learner) -> torch.Tensor:
-    return learner.published.conv1.bias.detach().clone()
+    return learner.tested.conv1.bias.detach().clone()
 
 
 def test_the_average_follows_the_parameters_as_its_decay_says() -> None:
@@ -42,7 +42,17 @@ def test_the_average_is_published_and_learning_is_as_without() -> None:
         plain.step(random_batch(seed=step))
     assert plain.state().average == b""
     assert learner.state().model == plain.state().model
-    assert learner.payload() == weights_to_bytes(learner.published) != plain.payload()
+    assert learner.payload() == weights_to_bytes(learner.tested) != plain.payload()
+
+
+def test_actors_may_act_by_the_newest_parameters() -> None:
+    learner = make_learner(learner=AVERAGED.model_copy(update={"average_for": "evaluation"}))
+    learner.step(random_batch())
+    assert learner.payload() == weights_to_bytes(learner.online)
+    assert learner.average_payload() == weights_to_bytes(learner.tested) != learner.payload()
+    assert make_learner(learner=AVERAGED).average_payload() == b""
+    alone = FLOAT32.model_copy(update={"average_for": "evaluation"})
+    assert make_learner(learner=alone).average_payload() == b""
 
 
 def test_it_continues_to_the_bit_from_a_checkpoint(tmp_path: Path) -> None:
@@ -71,7 +81,7 @@ def test_initial_weights_replace_all_random_ones() -> None:
     source, learner = make_learner(), make_learner(learner=AVERAGED.model_copy(update={"seed": 1}))
     source.step(random_batch())
     learner.start_from(source.payload())
-    for network in (learner.online, learner.target, learner.published):
+    for network in (learner.online, learner.target, learner.tested):
         assert torch.equal(network.conv1.bias, source.online.conv1.bias)
     update = learner.step(random_batch())
     assert torch.isfinite(update.loss), "and steps go on from there"
