@@ -41,7 +41,8 @@ THOUSAND = TRIALS.with_name("thousand")
 _HELD = 0.5  # share of replay's reports from which on its limiter holds the actors
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.S)
 _RATE = 4300.0  # robot steps per second of an actor with a dedicated core: docs/profile.md
-_UPDATES = 42.0  # of `quick`, per second, by a learner on two cores: benchmarks/results/quick-sooner
+# Of `quick`, per second, by a learner on two cores: benchmarks/results/quick-sooner.
+_UPDATES = 42.0
 _ACTORS = (10, 100, 1000, 10_000)
 
 _HEAD = """# Configuration
