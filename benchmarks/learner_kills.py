@@ -53,6 +53,7 @@ OFTEN = (
     "--learner.publish_period=25",
     "--learner.checkpoint_period_s=5",
     "--evaluator.period_s=5",
+    "--learner.average_for=all",  # robots act by what is published
     "--run.learner_steps=0",
 )
 DURING_START = 5  # every fifth kill is followed by one during the learner's start-up

@@ -343,8 +343,8 @@ class AgentConfig(Section):
     controller, **which sees the true state**, by a margin (Hester et al. 2018). The states are the
     learner's own (Ross et al. 2011). The test never sees it. (ours)"""
     demonstration_margin: Positive = 0.2
-    """By how much the value of the action shown is to exceed the others', in scaled rewards. (ours;
-    DQfD: 0.8)"""
+    """Amount by which the value of the action shown is to exceed the others', in scaled rewards.
+    (ours; DQfD: 0.8)"""
     demonstration_schedule: Schedule = ((0, 1.0),)
     """Points (learner step, weight 0 to 100 of the margin's loss), linear between, constant after
     the last. (ours; DQfD: 1)"""

@@ -76,12 +76,9 @@ class WeightsPublisher:
             self.save()
         self.version += 1
         learner = self._learner
-        payloads = learner.payload(), learner.average_payload()
-        weights, average = (
-            Weights.of(self.epoch, self.version, learner.learner_step, payload)
-            for payload in payloads
-        )
-        self._writer.publish(weights, average if average.payload else weights)
+        payloads = filter(None, (learner.payload(), learner.average_payload()))
+        numbers = self.epoch, self.version, learner.learner_step
+        self._writer.publish(*(Weights.of(*numbers, payload) for payload in payloads))
 
     def maybe_save(self) -> None:
         """Save if the checkpoint period has passed; what cannot be written now is tried again."""

@@ -18,6 +18,7 @@ KILLS, STEPS = 3, 20
 @pytest.mark.system
 def test_versions_never_go_back_and_training_goes_on(tmp_path: Path) -> None:
     configured = ["--config", "smoke", *SMALL, "--run.learner_steps=0"]
+    configured += ["--learner.average_for=all"]  # robots act by what is published
     found = ordeal(tmp_path, configured, kills=KILLS, seed=0, steps=STEPS, longest_s=0.5)
     assert found["kills"] == KILLS
     assert (found["went_back"], found["mixed"]) == ([], [])

@@ -43,6 +43,21 @@ def assigned_distances_px(scene: Scene, taking_part: BoolArray) -> Float64Array:
     return np.array([each[linear_sum_assignment(each)] for each in distances])
 
 
+def first_assigned(costs: Float64Array) -> int:
+    """The target that the least sum of costs [K, M] assigns to the first robot; NaN: absent.
+
+    The cheapest one where there are too few targets; 0 where there is none, or no first robot.
+    """
+    known = np.isfinite(costs)
+    if not known[0].any():
+        return 0
+    robots, targets = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known[0])
+    those = np.nan_to_num(costs[np.ix_(robots, targets)], posinf=np.finfo(np.float64).max)
+    rows, columns = linear_sum_assignment(those)
+    own = columns[rows == 0]
+    return int(targets[own[0] if own.size else those[0].argmin()])
+
+
 def remaining_rad(
     headings: Float64Array, wanted: Float64Array, config: ArenaConfig
 ) -> Float64Array:

@@ -20,7 +20,11 @@ TESTED_ROBOTS = 4  # of Table 2
 RATE_FACTORS = (0.5, 1.0, 2.0)  # of the sweep, times the base's learning rate
 SWEEP_ROBOTS = 2
 # The test and the weights are the paper's, whatever the base has.
-AS_PRINTED = {"agent.symmetric_views": 1, "learner.average_decay": 0.0}
+AS_PRINTED = {
+    "agent.symmetric_views": 1,
+    "learner.average_decay": 0.0,
+    "learner.average_for": "all",
+}
 RATES = dict.fromkeys(KINDS, 1.0)
 """Factor of each kind's learning rate in all runs but the sweep's; set by the sweep's rule."""
 

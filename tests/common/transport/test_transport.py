@@ -1045,5 +1045,5 @@ def test_a_session_that_cannot_declare_everything_is_replaced_again(
         monkeypatch.setattr(declaration, "make", fail_twice)
         router.close()
         with Session(config.model_copy(update={"listen": (endpoint,)})):
+            eventually(lambda: not failures, "it is replaced")
             until_served(other, KEY, server)
-            assert not failures
