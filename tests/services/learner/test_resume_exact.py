@@ -62,7 +62,7 @@ class Run:
         self._folder = folder
         self.learner = Learner.from_config(config)
         writer = MagicMock()
-        writer.publish.side_effect = lambda weights: self._collector._policy.adopt(weights)
+        writer.publish.side_effect = lambda acting, *_: self._collector._policy.adopt(acting)
         checkpoints = folder / "checkpoints"
         self._publisher = WeightsPublisher(config, self.learner, writer, checkpoints)
         self._collate = make_collate(config, self.learner)
