@@ -49,9 +49,9 @@ def main() -> None:
         settings = [*CONDITIONS[condition], f"--robots={num_robots}"]
         settings += [f"--evaluator.epsilon={epsilon}"]
         if sees_state:
-            settings += ["--config=quick", f"--controller={name}"]
+            settings.append(f"--controller={name}")
         else:
-            settings += [name]
+            settings.append(name)
         given = subject(flags.evaluate().parse_args(settings))
         try:
             result, measures, _ = evaluate(

@@ -3,17 +3,13 @@
 python -m benchmarks.rivals_page
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 from benchmarks.rivals import CONDITIONS
-from benchmarks.summary import RESULTS, ROOT
+from benchmarks.summary import ROOT, Line, Lines
 
-LINES = RESULTS / "rivals" / "rivals.jsonl"
+LINES = "rivals/rivals.jsonl"
 PAGE = ROOT / "docs" / "rivals.md"
-
-Line = Mapping[str, Any]
 
 TEXTS = {
     "fixed": ("Fixed targets", "The paper's arena: one layout of targets for each number."),
@@ -34,7 +30,7 @@ TEXTS = {
 
 
 def main() -> None:
-    PAGE.write_text(text([json.loads(line) for line in LINES.read_text("utf-8").splitlines()]))
+    PAGE.write_text(text(Lines()(LINES)), "utf-8")
     print(PAGE)
 
 

@@ -131,7 +131,6 @@ def arena_view(arena: ArenaConfig) -> dict[str, Any]:
         "stack": arena.stack,
         "crop": arena.crop_px,
         "kind": arena.kind,
-        "custom": arena.is_custom,
         "actions": _action_names(arena),
     }
 

@@ -113,6 +113,16 @@ class Command:
         return self.process.wait(PATIENCE_S)
 
 
+def printed(
+    folder: Path, *arguments: str | Path, timeout_s: float = PATIENCE_S, **variables: str
+) -> str:
+    """What a command that must not fail prints, with these variables."""
+    with Command(arguments, folder, **variables) as command:
+        assert command.wait(timeout_s) == 0, command.err
+    assert "Traceback" not in command.err
+    return command.out
+
+
 @dataclass(frozen=True, slots=True)
 class Finished:
     """A run of `mrcdrl train` that ended by itself, and what it left."""

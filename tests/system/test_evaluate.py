@@ -9,17 +9,9 @@ import av
 import pytest
 
 from mrcdrl.common.config import load_config, to_toml, validate_config
-from tests.system.system_processes import Command, Finished
+from tests.system.system_processes import Finished, printed
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
-
-
-def printed(folder: Path, *arguments: str | Path, **variables: str) -> str:
-    """What a command that must not fail prints."""
-    with Command(arguments, folder, **variables) as command:
-        assert command.wait() == 0, command.err
-    assert "Traceback" not in command.err
-    return command.out
 
 
 def evaluated(folder: Path, *arguments: str | Path) -> dict[str, Any]:

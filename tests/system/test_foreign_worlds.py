@@ -7,7 +7,7 @@ import av
 import pytest
 import torch
 
-from tests.system.system_processes import Command, end_all, run_name
+from tests.system.system_processes import Command, end_all, printed, run_name
 
 ROOT = Path(__file__).parents[2]
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -18,12 +18,12 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 def test_a_foreign_world_is_learned_judged_and_filmed(
     world: str, agents: int, actions: int, tmp_path: Path
 ) -> None:
-    name = run_name("foreign")
+    name, here = run_name("foreign"), {"PYTHONPATH": str(ROOT)}
     train = ["train", name, "--run-dir", str(tmp_path), "--config", "smoke", "--no-web"]
     train += ["--env", f"benchmarks.foreign_worlds:{world}", "--run.learner_steps", "40"]
     train += ["--evaluator.episodes", "2", "--arena.max_frames", "30", "--replay.min_size", "100"]
     try:
-        with Command(train, tmp_path, PYTHONPATH=str(ROOT)) as command:
+        with Command(train, tmp_path, **here) as command:
             assert command.wait(600) == 0, command.err
     finally:
         end_all(name)
@@ -37,22 +37,15 @@ def test_a_foreign_world_is_learned_judged_and_filmed(
     assert f"num_actions = {actions}" in settings
     with av.open(str(run / "evaluation.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) > 4
-    told = said("evaluate", run, "--episodes", "2", "--json", folder=tmp_path)
+    told = printed(tmp_path, "evaluate", run, "--episodes", "2", "--json", **here)
     assert json.loads(told)["num_robots"] == agents
     exported = tmp_path / "policy.ts"
-    assert "largest difference" in said("export", run, "--out", exported, folder=tmp_path)
+    assert "largest difference" in printed(tmp_path, "export", run, "--out", exported, **here)
     network = torch.jit.load(str(exported))
     assert network(torch.zeros((1, 4, 60, 60), dtype=torch.uint8)).shape == (1, actions)
     resume = ["train", "--resume", run, "--run.learner_steps", "60", "--json", "--no-web"]
     try:
-        again = json.loads(said(*resume, folder=tmp_path))
+        again = json.loads(printed(tmp_path, *resume, timeout_s=600, **here))
     finally:
         end_all(name)
     assert again["learner_steps"] >= 60, again
-
-
-def said(*arguments: str | Path, folder: Path) -> str:
-    """What a command that must not fail prints."""
-    with Command(arguments, folder, PYTHONPATH=str(ROOT)) as command:
-        assert command.wait(600) == 0, command.err
-    return command.out

@@ -9,6 +9,9 @@ const COLOURS = ["#ffffff", "#7fd99a", "#f5c26b", "#c9a7ff", "#6fd6de", "#ff9d94
 const OUTCOMES = { success: "success: every robot is on a target", collision: "over: too many collisions", timeout: "over: out of time" };
 const WORLD_OUTCOMES = { success: "success", collision: "over, without success", timeout: "over: out of time" };
 
+// Whether it is a custom world, which has pictures and no lengths.
+export const isWorld = (arena) => arena.kind === "custom";
+
 export class ArenaView {
   constructor() {
     this.canvas = byId("arena-canvas");
@@ -33,10 +36,10 @@ export class ArenaView {
     requestAnimationFrame((now) => this.#tick(now));
   }
 
-  // arena: of the run's settings. A custom world has no lengths: its agents' pictures are shown.
+  // arena: of the run's settings; of a custom world the agents' pictures are shown.
   configure(arena) {
     this.arena = arena;
-    byId("trails").parentElement.hidden = arena.custom;
+    byId("trails").parentElement.hidden = isWorld(arena);
   }
 
   clear() {
@@ -114,7 +117,7 @@ export class ArenaView {
     const arena = this.arena;
     const side = Math.round(this.canvas.clientWidth * devicePixelRatio) || 600;
     if (this.canvas.width !== side) this.canvas.width = this.canvas.height = side;
-    if (arena.custom) this.#drawPictures(frame, side);
+    if (isWorld(arena)) this.#drawPictures(frame, side);
     else this.#drawArena(frame, place, side);
     this.#tell(frame, place);
     this.#drawRobots(frame, place);
@@ -227,7 +230,7 @@ export class ArenaView {
     ];
     byId("moment").textContent = words.join(" · ");
     const hits = frame.collided.map((hit, robot) => (hit ? robot + 1 : 0)).filter(Boolean);
-    const custom = this.arena.custom;
+    const custom = isWorld(this.arena);
     const ending = (custom ? WORLD_OUTCOMES : OUTCOMES)[frame.outcome] ?? "";
     const said = ending ? `Episode ${frame.episode}: ${ending}.` : this.said;
     if (said !== this.said) byId("ending").textContent = this.said = said;
@@ -268,7 +271,7 @@ export class ArenaView {
 }
 
 function robotPanel(robot, arena) {
-  const name = `${arena.custom ? "Agent" : "Robot"} ${robot + 1}`;
+  const name = `${isWorld(arena) ? "Agent" : "Robot"} ${robot + 1}`;
   const swatch = element("span", { className: "swatch", "aria-hidden": "true" });
   swatch.style.background = COLOURS[robot % COLOURS.length];
   const values = element("div", { className: "q" });
@@ -297,7 +300,8 @@ function drawViews(canvas, images, side) {
   });
 }
 
-function drawValues(panel, values, action, { actions, custom }) {
+function drawValues(panel, values, action, arena) {
+  const actions = arena.actions;
   const cells = panel.querySelector(".q").children;
   const why = panel.querySelector(".why");
   if (!values) {
@@ -319,7 +323,7 @@ function drawValues(panel, values, action, { actions, custom }) {
     cells[3 * i + 1].firstChild.style.width = value === null ? "0" : `${8 + (92 * (value - low)) / span}%`;
     cells[3 * i + 2].textContent = number(value);
   });
-  why.textContent = `${custom ? "takes" : "goes"} ${actions[action]}${action === best ? ", the best by its values" : ", at random: it explores"}`;
+  why.textContent = `${isWorld(arena) ? "takes" : "goes"} ${actions[action]}${action === best ? ", the best by its values" : ", at random: it explores"}`;
 }
 
 function disc(c, x, y, radius) {

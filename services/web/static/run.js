@@ -1,5 +1,5 @@
 // The page of one run.
-import { ArenaView } from "./arena.js";
+import { ArenaView, isWorld } from "./arena.js";
 import { Axis, Chart, joined, withAxis } from "./chart.js";
 import { FIGURES, columnsOf, derived } from "./figures.js";
 import { byId, duration, element, fetched, fill, leftBehind, number, param, percent, presetText, say, stateClass, stateText } from "./common.js";
@@ -16,7 +16,7 @@ let tables = { history: {}, episodes: {}, tests: [] };
 let watched = ""; // role/worker; empty until frames come of the first actor, which the server finds
 let seenEvaluations = -1;
 
-const LEGEND_OF_A_WORLD = "The world as its agents see it: the newest picture of each, in grey as their network gets it. A worker plays far faster than anyone can follow: every frame of some of its episodes is shown, at 15 a second, so a little after it happened.";
+const LEGEND_OF_A_WORLD = "The world as its agents see it: the newest picture of each, in grey as their network gets it.";
 const arena = new ArenaView();
 const axis = new Axis(byId("axis"), () => load());
 const zoom = (from, to, along) => {
@@ -86,7 +86,7 @@ function showInfo() {
   ].filter(Boolean).join(" · ");
   if (settings) {
     arena.configure(settings.arena);
-    if (settings.arena.custom) byId("legend").textContent = LEGEND_OF_A_WORLD;
+    if (isWorld(settings.arena)) byId("legend").textContent = LEGEND_OF_A_WORLD;
     showSettings(settings);
   } else {
     say("The settings of this run are of another version of mrcdrl: only its curves can be shown.");
@@ -188,7 +188,7 @@ function show(told) {
 function lead(told, up) {
   const info = about?.info ?? {};
   const one = info.robots === 1;
-  const who = about?.settings?.arena.custom ? "agent" : "robot";
+  const who = about?.settings && isWorld(about.settings.arena) ? "agent" : "robot";
   const many = one ? `One ${who} learns` : `${info.robots ?? "Some"} ${who}s learn`;
   const aim = who === "agent" ? "to act in a custom world" : `to reach ${one ? "a target" : "a target each"} without touching anything`;
   const what = `${many} ${aim}, from what ${one ? "it sees" : "each of them sees"}.`;

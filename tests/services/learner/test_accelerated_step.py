@@ -44,6 +44,25 @@ def assert_near(found: list[dict[str, Tensor]], expected: list[dict[str, Tensor]
             torch.testing.assert_close(other[name], due, atol=bound, rtol=0.0, msg=name)
 
 
+def assert_same_term(
+    agent: AgentConfig,
+    given: Sequence[Batch],
+    threads: int,
+    without: tuple[AgentConfig, Sequence[Batch]],
+) -> None:
+    """A term of the loss counts in the accelerated step as in the plain one, and does count."""
+    online, target = networks("duel")
+    expected = moved(PlainStep(online, target, agent), online, given)
+    online, target = networks("duel")
+    found = moved(AcceleratedStep(online, target, agent, num_threads=threads), online, given)
+    assert_near(found, expected)
+    other, batches_without = without
+    online, target = networks("duel")
+    lacking = moved(PlainStep(online, target, other), online, batches_without)
+    with pytest.raises(AssertionError):  # else the term is lost on both sides
+        assert_near(lacking, expected)
+
+
 @pytest.mark.parametrize("kind", ["duel", "ddqn", "dqn"])
 @pytest.mark.parametrize("loss", ["squared", "huber"])
 @pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
@@ -74,15 +93,7 @@ def test_munchausen_does_what_it_does_in_the_plain_step(
         munchausen_alpha=0.9, munchausen_temperature=temperature, optimizer_epsilon=1e-2
     )
     given = [darkened(batch, nonzero) for batch in batches(4)]
-    online, target = networks("duel")
-    expected = moved(PlainStep(online, target, agent), online, given)
-    online, target = networks("duel")
-    found = moved(AcceleratedStep(online, target, agent, num_threads=threads), online, given)
-    assert_near(found, expected)
-    online, target = networks("duel")
-    without = moved(PlainStep(online, target, AgentConfig()), online, given)
-    with pytest.raises(AssertionError):  # else the term is lost on both sides
-        assert_near(without, expected)
+    assert_same_term(agent, given, threads, without=(AgentConfig(), given))
 
 
 @pytest.mark.parametrize("nonzero", [1.0, 0.05])

@@ -14,14 +14,12 @@ from mrcdrl.common.arena.world.scene import Scene
 from mrcdrl.common.config import AgentConfig, ArenaConfig, load_config
 from mrcdrl.common.errors import ConfigError
 from mrcdrl.common.messages.trajectory import Outcome
-from mrcdrl.services.learner.accelerate.step import AcceleratedStep
 from mrcdrl.services.learner.batch import Batch, Demonstration, collate
 from mrcdrl.services.learner.demonstrator import demonstrator
 from mrcdrl.services.learner.loss import td_loss
 from mrcdrl.services.learner.rendering import HostRenderer
-from mrcdrl.services.learner.step import PlainStep
 from mrcdrl.services.learner.symmetries import LayoutSymmetries
-from tests.services.learner.test_accelerated_step import assert_near, moved, networks
+from tests.services.learner.test_accelerated_step import assert_same_term
 from tests.services.learner.test_batch import make_samples
 from tests.services.learner.test_cuda_graphs import batches
 
@@ -148,15 +146,7 @@ def test_the_margin_by_hand() -> None:
 def test_the_accelerated_step_is_drawn_as_the_plain_one(threads: int) -> None:
     agent = AgentConfig(demonstration_margin=0.3, optimizer_epsilon=1e-2)
     given = [shown_in(batch, 2.0) for batch in batches(4)]
-    online, target = networks("duel")
-    expected = moved(PlainStep(online, target, agent), online, given)
-    online, target = networks("duel")
-    found = moved(AcceleratedStep(online, target, agent, num_threads=threads), online, given)
-    assert_near(found, expected)
-    online, target = networks("duel")
-    without = moved(PlainStep(online, target, agent), online, batches(4))
-    with pytest.raises(AssertionError):  # else the term is lost on both sides
-        assert_near(without, expected)
+    assert_same_term(agent, given, threads, without=(agent, batches(4)))
 
 
 def test_pictures_hold_no_poses() -> None:

@@ -68,27 +68,37 @@ def free_target(played: Shown) -> tuple[int, float, float] | None:
 
 def drag(page: Page, played: Shown) -> bool:
     """Drag a free target; whether it was in time: robots move meanwhile."""
-    found = free_target(played)
-    if found is None:
-        return False
-    index, x, y = found
-    page.mouse.move(*at(page, x, y))
-    page.mouse.down()
-    page.mouse.move(*at(page, 300, 250), steps=5)
-    page.mouse.move(*at(page, 300, 310), steps=5)
-    page.mouse.up()
-    return _comes(played, ("target", index, 300, 310))
+
+    def dragged(x: float, y: float) -> None:
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(*at(page, 300, 250), steps=5)
+        page.mouse.move(*at(page, 300, 310), steps=5)
+        page.mouse.up()
+
+    return _point(page, played, dragged, (300, 310))
 
 
 def click(page: Page, played: Shown) -> bool:
     """Click a free target and then a place; whether it was in time."""
+
+    def clicked(x: float, y: float) -> None:
+        page.mouse.click(x, y)
+        page.mouse.click(*at(page, 300, 300))
+
+    return _point(page, played, clicked, (300, 300))
+
+
+def _point(
+    page: Page, played: Shown, move: Callable[[float, float], None], to: tuple[float, float]
+) -> bool:
+    """Move a free target from its place on the screen; whether it is asked to go there."""
     found = free_target(played)
     if found is None:
         return False
     index, x, y = found
-    page.mouse.click(*at(page, x, y))
-    page.mouse.click(*at(page, 300, 300))
-    return _comes(played, ("target", index, 300, 300))
+    move(*at(page, x, y))
+    return _comes(played, ("target", index, *to))
 
 
 def press(page: Page, played: Shown) -> bool:
